@@ -45,6 +45,12 @@ def callees(program: Program, function: Function, call: cst.Call) -> List[Functi
     return [target for target in _resolved(program, function, call.func) if isinstance(target, Function)]
 
 
+def values_of(program: Program, function: Function, node: Optional[cst.CSTNode]) -> List[Tuple[Function, cst.CSTNode]]:
+    """Return what the functions return that an expression calls for certain, each value with its function."""
+    runs = callees(program, function, node) if isinstance(node, cst.Call) else []
+    return [(run, value) for run in runs for value in run.flow.returns]
+
+
 def given_to(
     program: Program, function: Function, parameter: str
 ) -> Iterator[Tuple[Function, Optional[cst.BaseExpression]]]:

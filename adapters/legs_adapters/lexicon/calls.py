@@ -33,6 +33,7 @@ from legs_adapters.tensors.operations import (
     EXTREMES,
     JOINS,
     KEEPS_PICTURES,
+    LEARNED,
     MODULES,
     NUMBERS,
     PICTURE_FUNCTIONS,
@@ -175,16 +176,20 @@ def _of_images(call: CallReading) -> Optional[Meaning]:
     """
     references = call.program.resolve(call.function, call.node.func)
     is_member = call.owner is not None and dotted(call.owner) == "self"
+    given = [call.ask(value) for value in call.values if constant(value) is None]
+    if any(LEARNED.match(str(each.target)) for each in references) and mix(given).role in ("target", "both"):
+        return Meaning("feature", mix(given).role)  # a network makes no photograph of one
     if any(map(_is_unlisted, references)) or (is_member and not references):
         return None
-    given = [call.ask(value) for value in call.values if constant(value) is None]
     images = [meaning for meaning in given if meaning.kind == "image"]
     if not images:
         kinds = ("depth", "channel", "normal", "flow", *(["feature"] if given and given[0].role == "target" else []))
         return given[0] if len(given) == 1 and given[0].kind in kinds else None
     bodies = [returned(target) for target in (each.target for each in references) if isinstance(target, Function)]
     changes = any(is_of_neighbours(part) for body in bodies if body is not None for part in attribute_chain(body))
-    return mix(images)._replace(kind="gradient") if changes else mix(images)
+    made, of = meaning_returned(call) or UNKNOWN, mix(images)
+    is_feature = made.kind == "feature" and made.role in ("target", "both")
+    return of._replace(kind="gradient" if changes else "feature" if is_feature else of.kind)
 
 
 def is_of_neighbours(

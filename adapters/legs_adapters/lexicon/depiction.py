@@ -11,7 +11,7 @@ from typing import FrozenSet, List, Optional, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.calls import callees, sure_calls
+from legs_adapters.code.calls import callees, sure_calls, values_of
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
 from legs_adapters.code.questions import Questions
@@ -34,6 +34,7 @@ from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import BACKGROUND, COLORS, DATA, KIND_OF, LOSS, RENDER
 from legs_adapters.tensors.backward import Training
+from legs_adapters.tensors.operations import CONCATENATES
 
 _LITERALS = (cst.Dict, cst.List, cst.Tuple)
 _Argument = Tuple[Function, cst.Call, Optional[cst.BaseExpression]]  # with the call, and the function around it
@@ -112,7 +113,17 @@ class Meanings:
         if is_fourth(node) or self._is_behind(function, node):
             return Meaning("channel", self.meaning(function, node.value).role)  # of RGB+D: render[..., 3], render[3:]
         keys = [key] if isinstance(key, str) else self._keys(function, node.slice[-1].slice)
-        return mix(self._member(function, node, each) for each in keys) if keys else self.meaning(function, node.value)
+        if keys:
+            return mix(self._member(function, node, each) for each in keys)
+        return self._first(function, node.value, _cut(node) in ((None, 3), (0, 3)))
+
+    def _first(self, function: Function, node: cst.CSTNode, is_cut: bool) -> Meaning:
+        """Return the meaning of a value; of what is cut off it that of its first part: ``cat([image, depth])[:3]``."""
+        whole = function.flow.value_of(node) or node
+        made = [(function, whole), *values_of(self.program, function, whole)] if is_cut else []
+        joins = [(by, call) for by, call in made if isinstance(call, cst.Call) and call_name(call) in CONCATENATES]
+        firsts = [(by, part) for by, call in joins for part in parts_of(call.args[0].value)[:1]]
+        return mix(self.meaning(*first) for first in firsts) if firsts else self.meaning(function, node)
 
     def _is_behind(self, function: Function, node: cst.Subscript) -> bool:
         """Return whether one channel behind the colours is taken: ``x[3]``, ``x[-1:]``, ``x.split([3, 1])[1]``."""
@@ -218,6 +229,8 @@ class Meanings:
             return Meaning("channel", self.meaning(function, value).role)
         if call_name(value) == "zip" and index < len(given):
             return self.meaning(function, given[index])
+        if call_name(value) == "split" and index == 0 and given and isinstance(value.func, cst.Attribute):
+            return self._first(function, value.func.value if constant(given[0]) is not None else given[0], True)
         # A renderer that returns a tuple returns the image first; the rest have names of their own.
         meaning = self.meaning(function, value)
         if meaning.kind == "image" and index > 0:
@@ -303,5 +316,6 @@ def _is_opacity(part: cst.CSTNode, node: cst.BinaryOperation | cst.BooleanOperat
         return False
     left, right = node.left, node.right
     colours = left if part is right else right
-    is_over = isinstance(colours, cst.Subscript) and same(colours.value, part.value)  # type: ignore[attr-defined]
+    values = [each.value for each in walk_expressions(colours) if isinstance(each, cst.Subscript)]
+    is_over = any(same(value, part.value) for value in values)  # type: ignore[attr-defined]
     return constant(left) == 1 if isinstance(node.operator, cst.Subtract) else is_over

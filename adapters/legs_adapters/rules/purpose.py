@@ -11,7 +11,7 @@ from typing import Any, Callable, Dict, List, Optional, Sequence, Set, Tuple, Ty
 
 import libcst as cst
 
-from legs_adapters.code.calls import callees, given_to, likely_calls
+from legs_adapters.code.calls import callees, given_to, likely_calls, values_of
 from legs_adapters.code.limits import remembered
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
@@ -58,6 +58,16 @@ class Purposes:
             return Evidence("no-step", "scoring", [score])
         return self._once(self._purpose, function, node, depth)
 
+    def of_call(self, function: Function, node: cst.CSTNode, caller: Function, call: cst.Call) -> Optional[Evidence]:
+        """Return the evidence that one call of a function trains no Gaussians: by its step, or optimiser."""
+        if not any(map(is_backward, function.flow.calls)):
+            return self.purpose(caller, call)
+        steps = self._after(function, node)[1]
+        given = [(step, function.given(call, step[2].value)) for step in steps if isinstance(step[2], cst.Name)]
+        moved = [self._moved((caller, step[1], value, set(), [])) for step, value in given if value is not None]
+        is_of_poses = bool(moved) and len(moved) == len(steps) and all(map(_are_poses, moved))
+        return Evidence("pose-step", "tracking", [(caller, call)]) if is_of_poses else None
+
     def moves_gaussians(self, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
         """Return whether an optimiser that steps after the backward pass of an expression is known to have them."""
         return self._once(self._moves, function, node, depth)
@@ -86,7 +96,7 @@ class Purposes:
         moved, first = [self._moved(step) for step in steps], [step[:2] for step in steps[:1]]
         if steps and all(self._moved_by(step) == [] for step in steps):
             return Evidence("no-step", "scoring", first)
-        if steps and all(some & (POSES | EMBEDDING) and not some & MODELS for some in moved):
+        if steps and all(map(_are_poses, moved)):
             return Evidence("pose-step", "tracking", first)
         if steps and not any(some & MODELS for some in moved) and self._draws_a_model(function, 0):
             return Evidence("other-step", "tracking", first) if all(map(self._is_beside, steps)) else None
@@ -215,8 +225,8 @@ class Purposes:
     def _made_with(self, where: Function, made: Optional[cst.CSTNode]) -> List[_Value]:
         """Return what an optimiser is made with, in a helper too; nothing for what makes none."""
         of = _optimised(made)
-        helpers = callees(self.program, where, made) if isinstance(made, cst.Call) and of is None else []
-        inner = [(helper, _optimised(value)) for helper in helpers for value in helper.flow.returns]
+        returned = values_of(self.program, where, made) if of is None else []
+        inner = [(helper, _optimised(value)) for helper, value in returned]
         passed = [helper.given(made, own.value) for helper, own in inner if isinstance(own, cst.Name)]  # type: ignore[arg-type]
         return [(where, each) for each in [of, *passed] if each is not None]
 
@@ -255,13 +265,8 @@ class Purposes:
             entries = [each.value for each in literal if constant(each.key) in ("params", "name")]
         elif isinstance(node, cst.Name):
             values = function.flow.assigned(node)
-            helpers = [
-                each
-                for value in values
-                if isinstance(value, cst.Call)
-                for each in callees(self.program, function, value)
-            ]
-            lists = [(function, value) for value in values] + [(by, of) for by in helpers for of in by.flow.returns]
+            lists = [(function, value) for value in values]
+            lists += [each for value in values for each in values_of(self.program, function, value)]
             return [each for each in lists if isinstance(each[1], (cst.List, cst.Tuple, cst.Dict))]
         elif isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) == "values":
             entries = _entries(function.flow.value_of(node.func.value))
@@ -277,6 +282,11 @@ class Purposes:
             return True
         inner = (each for call in calls for each in callees(self.program, function, call))
         return depth < 2 and any(self._draws_a_model(each, depth + 1) for each in inner)
+
+
+def _are_poses(moved: Set[str]) -> bool:
+    """Return whether what an optimiser moves is poses or embeddings alone, by the words."""
+    return bool(moved & (POSES | EMBEDDING)) and not moved & MODELS
 
 
 def _definitions(program: Program, function: Function, node: cst.CSTNode) -> List[Tuple[Function, Definition]]:
@@ -320,6 +330,6 @@ def _is_own_tensor(program: Program, function: Function, value: Optional[cst.CST
     counts = [part for part in sizes if isinstance(part, cst.Call) and call_name(part) == "len"]
     if words_in(*sizes) & TENSORS or words_in(*counts) & GAUSSIANS:
         return False
-    helpers = [(each, of) for each in callees(program, function, made[-1]) for of in each.flow.returns]
+    helpers = values_of(program, function, made[-1])
     of_helpers = bool(helpers) and all(_is_own_tensor(program, *helper) for helper in helpers)
     return call_name(made[-1]) in NEW_TENSORS or of_helpers

@@ -6,13 +6,16 @@ from typing import Iterator, List, Optional, Sequence, Tuple
 
 import libcst as cst
 
+from legs_adapters.code.calls import likely_calls
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import arguments
+from legs_adapters.code.syntax import arguments, words_in
 from legs_adapters.lexicon.meaning import Meaning, swapped
+from legs_adapters.lexicon.words import TRACKING
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.causes.distillation import is_rendered
 from legs_adapters.rules.causes.kinds import KINDS
 from legs_adapters.rules.order import RULES
+from legs_adapters.rules.rule import Term
 from legs_adapters.terms.findings import Evidence, Use
 from legs_adapters.terms.sides import surest
 
@@ -20,18 +23,23 @@ _Call = Tuple[Function, cst.Call, List[Optional[cst.BaseExpression]]]
 _DEPTH = 3  # functions that hand on what they are given
 
 
-def uses_of(analysis: Analysis, function: Function, prediction: cst.CSTNode, target: cst.CSTNode) -> List[Use]:
-    """Classify the calls, in the training step, of a function that compares two of its parameters."""
+def uses_of(analysis: Analysis, term: Term) -> List[Use]:
+    """Classify the calls, in the training step, of a function that compares two pictures."""
     found: List[Use] = []
-    names = [side.value for side in (prediction, target) if isinstance(side, cst.Name)]
-    for caller, call, sides in _calls(analysis, function, names) if isinstance(target, cst.Name) else ():
-        if arguments(call)[2]:  # starred
+    function, target = term.function, term.target
+    names = [side.value for side in (term.prediction, target) if isinstance(side, cst.Name)]
+    is_given = isinstance(target, cst.Name) and target.value in function.parameters
+    for caller, call, sides in _calls(analysis, function, names):
+        image = sides[-1] if is_given else None
+        if is_given and arguments(call)[2]:  # starred
             found.append(Use(caller, call, None, False))
-        elif sides[-1] is not None:
+        elif image is None and not TRACKING & words_in(call):  # the step decides; in the others a branch may
+            found.append(Use(caller, call, analysis.purposes.of_call(function, term.form.call, caller, call), True))
+        elif image is not None:
             both = [side for side in sides if side is not None]
             answers = surest(analysis.meanings, analysis.ways, caller, both)
             given = [answers.meaning(caller, side) for side in both]
-            other = _why_other(analysis, caller, call, given, is_rendered(analysis, caller, sides[-1]))
+            other = _why_other(analysis, caller, call, given, is_rendered(analysis, caller, image))
             is_loss = given[0].kind == "image" and given[-1].role == "target"
             is_loss = is_loss and (len(given) == 1 or swapped(*given) is False)
             found.append(Use(caller, call, other, is_loss or other is not None))
@@ -41,7 +49,7 @@ def uses_of(analysis: Analysis, function: Function, prediction: cst.CSTNode, tar
 def _calls(analysis: Analysis, function: Function, names: Sequence[str], depth: int = 0) -> Iterator[_Call]:
     """Yield the calls that give a function these parameters, past callers that only hand on their own."""
     sites = analysis.training.sites
-    for caller, call in sites.get(function, []):
+    for caller, call in sites.get(function) or likely_calls(analysis.program, function):
         sides = [function.given(call, name) for name in names]
         own = [side.value for side in sides if isinstance(side, cst.Name) and caller.is_parameter(side)]
         if len(own) == len(names) and caller in sites and depth < _DEPTH:

@@ -7,7 +7,7 @@ from typing import List, NamedTuple, Optional, Tuple
 
 import libcst as cst
 
-from legs_adapters.code.calls import callees
+from legs_adapters.code.calls import values_of
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.reaching import Definition
@@ -65,7 +65,7 @@ class Verdicts:
         why = self._why_by_hand(term, by_hand)
         if why is not None:
             return why
-        uses = uses_of(self.analysis, function, term.prediction, term.target)
+        uses = uses_of(self.analysis, term)
         others = [use for use in uses if use.other is not None]
         if others and len(others) == len(uses):
             return Left.at(function, place, others[0].other or "")
@@ -175,8 +175,7 @@ class Verdicts:
                 given = [arg.value for arg in node.args if not FILES & words_in(arg.value)]
                 if PHOTOGRAPH in [meaning(where, each) for each in given] and self._is_unknown(where, node):
                     return node
-                runs = callees(self.analysis.program, where, node)
-                returned = [(callee, value) for callee in runs for value in callee.flow.returns]
+                returned = values_of(self.analysis.program, where, node)
                 parts = [*given, *attribute_chain(node.func)] if call_name(node) in KEEPS_PICTURES else []
             elif isinstance(node, cst.BinaryOperation):  # photo * segment(photo): a mask
                 shown = [part for part in parts if meaning(where, part) == PHOTOGRAPH]

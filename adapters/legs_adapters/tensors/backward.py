@@ -76,10 +76,9 @@ class Training:
         """
 
         def has(value: cst.CSTNode) -> bool:
-            return any(part is call for part in walk_expressions(value)) or depends(function, value, names)
+            return depends(function, value, names, call)
 
         made = [(each, each.value) for each in function.flow.every_definition if each.value is not None]
-        names = names | {each.place for each, value in made if call is not None and call in walk_expressions(value)}
         given = [value for each, value in made if _is_less(each) or each.place.endswith(".grad")]
         given += [arg.value for each in function.flow.calls if _is_downhill(each) for arg in each.args]
         if any(has(value) and not any(map(_loses_sign, attribute_chain(value))) for value in given):

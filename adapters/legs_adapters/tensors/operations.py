@@ -6,7 +6,7 @@ An operation may stand in several lists: ``detach`` moves a value, and ends its 
 from __future__ import annotations
 
 import re
-from typing import List, Set
+from typing import List, Optional, Set
 
 import libcst as cst
 
@@ -26,7 +26,8 @@ _AXES = word_set(
     """
 )
 _MAKES = word_set("BoolTensor FloatTensor Tensor array as_tensor asarray from_numpy tensor")  # of the same values
-JOINS = word_set("cat concat concatenate hstack stack vstack")  # several values as one
+CONCATENATES = word_set("cat concat concatenate")  # several values as one, channel beside channel
+JOINS = CONCATENATES | word_set("hstack stack vstack")
 KEEPS_AXES = _MOVES | LIMITS  # every value keeps its place
 LIKE = word_set("expand_as reshape_as to type_as view_as")  # uses a tensor's type or shape, not its values
 ASKS = word_set("isfinite isinf isnan ones_like zeros_like")  # tests of values
@@ -49,8 +50,9 @@ OTHER_LOSSES = word_set("huber_loss mse_loss norm smooth_l1_loss")
 MODULES = word_set("F TF einops functional nn np numpy torch")  # as torch and its neighbours are imported
 # Libraries whose operations make no other picture of one, but for the networks in them; and what hands on values.
 OF_IMAGES = re.compile(
-    r"(torch(?!\.hub)|torchvision(?!\.models)|kornia|numpy|PIL|cv2|skimage|scipy|einops|imageio|copy|itertools|random)\b"
+    r"(torch(?!\.hub)|torchvision(?!\.models)|kornia|numpy|PIL|cv2|skimage|scipy|einops|imageio|accelerate|lightning|pytorch_lightning|copy|itertools|random)\b"
 )
+LEARNED = re.compile(r"torch\.nn\.(Conv|Linear|Sequential|ModuleList|Embedding|Transformer|Multihead)")  # layers
 MODULE_SELF = word_set("cpu cuda double eval float half requires_grad_ to train")  # a module's methods that return it
 # These return a module wrapped; Lightning's fabric.setup, accelerate's prepare.
 MODULE_WRAPS = word_set("DDP DataParallel DistributedDataParallel compile convert_sync_batchnorm fabric.setup prepare")
@@ -73,16 +75,19 @@ _MIXES = word_set("addcmul bmm lerp matmul mm where")  # an exposure, a backgrou
 KEEPS_PICTURES = PICTURE_FUNCTIONS | TRANSFORMS | _MIXES
 
 
-def depends(function: Function, node: cst.CSTNode, names: Set[str]) -> bool:
-    """Return whether an expression of a function depends on the value of one of these names, not only on its size."""
+def depends(function: Function, node: cst.CSTNode, names: Set[str], call: Optional[cst.Call] = None) -> bool:
+    """Return whether an expression of a function depends on the value of one of these names, or of a call there.
+
+    What depends on the size alone does not.
+    """
     met: Set[Reaching] = set()
     work: List[cst.CSTNode] = [node]
     while work:
         part = work.pop()
-        if isinstance(part, (cst.Name, cst.Attribute)) and path_of(part) in names:
+        if part is call or (isinstance(part, (cst.Name, cst.Attribute)) and path_of(part) in names):
             return True
-        if isinstance(part, cst.Name):
+        if isinstance(part, (cst.Name, cst.Attribute)):
             work.extend(made.value for made in function.flow.reaching(part).new(met) if made.value is not None)
-        elif not (isinstance(part, cst.Attribute) and part.attr.value in SIZES):
+        if not (isinstance(part, cst.Attribute) and part.attr.value in SIZES):
             work.extend(children(part))
     return False

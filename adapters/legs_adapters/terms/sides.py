@@ -37,11 +37,6 @@ class Pair(NamedTuple):
     b: Meaning
     is_proven: bool = False
 
-    @property
-    def speaks_of_images(self) -> bool:
-        """Return whether the names of both sides are about images."""
-        return _speaks_of_images(self.first) and _speaks_of_images(self.second)
-
 
 def surest(meanings: Meanings, ways: Ways, function: Function, sides: Sequence[cst.CSTNode]) -> Meanings:
     """Return what answers for the sides of a term: their ways, where these prove both; else their names, too."""
@@ -110,7 +105,8 @@ def is_role(node: cst.CSTNode) -> bool:
     return isinstance(node, cst.Name) and all(role_of_words(word) is not None for word in words(node.value))
 
 
-def _speaks_of_images(node: cst.CSTNode) -> bool:
+def speaks_of_images(node: cst.CSTNode) -> bool:
+    """Return whether a name in it is about images."""
     parts = [part for part in walk_expressions(node) if isinstance(part, (cst.Name, cst.SimpleString))]
     names = [str(part.value if isinstance(part, cst.Name) else constant(part)) for part in parts]
     return "image" in map(kind_of_words, names)

@@ -270,9 +270,8 @@ def _thumbnails(files: Tuple[str, ...], side: int = SIDE) -> Tuple[Any, Any]:
                 pictures = [image.convert("RGB")]
                 for ground in ("black", "white") if image.mode in ("RGBA", "LA", "PA") else ():
                     pixels = image.convert("RGBA")
-                    pictures.append(
-                        Image.alpha_composite(Image.new("RGBA", pixels.size, ground), pixels).convert("RGB")
-                    )
+                    behind = Image.new("RGBA", pixels.size, ground)
+                    pictures.append(Image.alpha_composite(behind, pixels).convert("RGB"))
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             continue
         for picture in pictures:

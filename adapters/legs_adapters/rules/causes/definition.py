@@ -29,9 +29,8 @@ class InDefinition(Rule):
             return []
         calls = analysis.training.sites.get(function) or list(sure_calls(analysis.program, function))
         known = {id(form.call) for caller in dict(calls) for form in analysis.forms.in_function(caller)}
-        own = function in analysis.callbacks.assigned or all(
-            id(call) in known or shape(caller) is not None for caller, call in calls
-        )
+        are_own = [id(call) in known or shape(caller) is not None for caller, call in calls]
+        own = function in analysis.callbacks.assigned or all(are_own)
         return [header(function)] if own else []
 
     def may_be_loss(self, term: Term) -> bool:

@@ -61,12 +61,6 @@ KINDS = (
     OtherKind("mask", "mask", "a mask or an opacity map", 'package["alpha"], camera.mask'),
     OtherKind("synthetic", "warp", "a warped, edited or generated image, no photograph", "image, warped_image"),
     OtherKind("gradients", "gradient", "an edge map or an image gradient", "sobel(image), camera.edges"),
-    OtherKind(
-        "parameter",
-        "parameter",
-        "a parameter of the model, of a camera or of a material",
-        "gaussians.get_scaling, initial_scaling",
-        "regulariser",
-    ),
+    OtherKind("parameter", "parameter", "a parameter, of the model or a camera", "model.scales, scales", "regulariser"),
 )
 _NAMES = {rule.kind for rule in KINDS}

@@ -88,7 +88,7 @@ class OtherName(Rule):
         """Return the first name that has one of the words, unless both sides are proven."""
         module = term.function.module
         names = [(name, decider) for name, decider in term.names_around if not SPLATS.search(name)]
-        names += [] if _speaks_of_gaussians(module.text) else [(module.path.rpartition("/")[2], header(term.function))]
+        names += [] if "gaussian" in module.text.lower() else [(module.path.rpartition("/")[2], header(term.function))]
         found = [decider for name, decider in names if self.words & set(words(name))][:1]
         return [] if found and term.pair.is_proven and self._is_outweighed(term) else found
 
@@ -106,9 +106,7 @@ class OtherName(Rule):
 
 NAMES = (
     OtherName("warping", "synthetic", WARPED, "A name says that one view is warped into another.", "reprojection"),
-    OtherName(
-        "perceptual", "features", PERCEPTUAL, "A name is of a perceptual loss: it may compare features.", "vgg_l1"
-    ),
+    OtherName("perceptual", "features", PERCEPTUAL, "A name is of a perceptual loss, which compares features.", "vgg"),
     OtherName("mesh", "mesh", MESH, "A name is of a mesh: nothing proves that Gaussians are drawn.", "train_texture"),
     OtherName("robust", "huber", ROBUST, "A name is of a robust loss: a weight may move its threshold.", "huber"),
 )
@@ -118,11 +116,6 @@ NAMES = (
 def _are_proven(analysis: Analysis, function: Function) -> bool:
     """Return whether both sides of each term of a function are proven."""
     return all(Term(analysis, function, form).pair.is_proven for form in analysis.forms.in_function(function))
-
-
-@functools.lru_cache(maxsize=8)
-def _speaks_of_gaussians(text: str) -> bool:
-    return "gaussian" in text.lower()
 
 
 def _is_of_tracking(name: str) -> bool:

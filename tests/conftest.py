@@ -5,12 +5,17 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 from pathlib import Path
 from typing import Any, Iterator
 
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
+
+# Each process of the suite would compile each test and module again, where the environment asks that no code is kept.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # The same examples in every run; how long a busy machine takes to draw one says nothing about the code.
 settings.register_profile(

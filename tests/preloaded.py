@@ -86,6 +86,11 @@ def _serve():
     return None
 
 
+def abs_of(value):
+    """Return the absolute value."""
+    return abs(value)
+
+
 def _become(job):
     """Make this process that of the job: what a new Python would read at its start is read again."""
     opened = [os.open(os.devnull, os.O_RDONLY), *(os.open(job[to], os.O_WRONLY) for to in ("out", "err"))]
@@ -120,6 +125,9 @@ if __name__ == "__main__":
     for package in PACKAGES:
         with contextlib.suppress(ImportError):
             importlib.import_module(package)
+    with contextlib.suppress(ImportError):
+        importlib.import_module("PIL.Image").init()  # its plugins, a file each
+        importlib.import_module("numba").njit(abs_of)(1)  # numba reads what it can compile at its first function
     gc.freeze()  # what no collector touches at a process's end stays shared with the server
     found = _serve()
     if found is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
 import subprocess
 
@@ -11,7 +12,8 @@ from legs_loss.store import WeightStore
 from tests.precompute.test_cluster import Cluster, contents
 from tests.support import legs, legs_command, legs_environment, photograph, save
 
-pytest.importorskip("distributed")
+# Not imported here: it takes a second, and most processes of the suite run no test of this file.
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="distributed is not installed")
 pytestmark = pytest.mark.slow
 VIEWS = 24
 

@@ -22,8 +22,6 @@ def _compiles() -> bool:
     return supported is None or bool(supported())
 
 
-pytestmark = pytest.mark.skipif(not _compiles(), reason="this torch has no torch.compile for this Python")
-
 MASK = torch.linspace(0.0, 1.0, 16 * 20).reshape(16, 20)
 LOSSES = {
     "legs_loss": legs_loss,
@@ -40,6 +38,8 @@ LOSSES = {
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch, tmp_path):
     """Each test is a run of its own, started in an empty folder; nothing is compiled yet."""
+    if not _compiles():  # asked here, since torch's compiler takes a second to import
+        pytest.skip("this torch has no torch.compile for this Python")
     for name in [name for name in os.environ if name.startswith("LEGS_")]:
         monkeypatch.delenv(name)
     monkeypatch.setattr(sys, "argv", ["train.py"])

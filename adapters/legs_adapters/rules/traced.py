@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import libcst as cst
-import libcst.matchers as m
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import arguments, call_name, one_line
+from legs_adapters.code.syntax import arguments, call_name, one_line, walk_expressions
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.rule import Term
 from legs_adapters.rules.verdict import Verdicts
@@ -109,8 +108,8 @@ class _Join:
 
     def _leads_to(self, form: Form, inner: Frame) -> bool:
         """Return whether a form's own call led to a frame, and not a call in its arguments, as `render(camera)`."""
-        calls = [call for side in (form.first, form.second) for call in m.findall(side, m.Call())]
-        within = {call_name(cst.ensure_type(call, cst.Call)) for call in calls}
+        inside = (node for side in (form.first, form.second) for node in walk_expressions(side))
+        within = {call_name(node) for node in inside if isinstance(node, cst.Call)}
         if inner.name in ("forward", "__call__"):
             return not within or self._is_pair(inner)
         return inner.name not in within or inner.name == call_name(form.call)

@@ -21,7 +21,17 @@ import tempfile
 import types
 
 PATH = os.pathsep.join(path for path in sys.path if path)
-PACKAGES = ("torch", "numpy", "PIL.Image", "PIL.PngImagePlugin", "numba", "matplotlib.figure", "libcst")
+# torch's compiler is what building an optimiser imports.
+PACKAGES = (
+    "torch",
+    "torch._dynamo",
+    "numpy",
+    "PIL.Image",
+    "PIL.PngImagePlugin",
+    "numba",
+    "matplotlib.figure",
+    "libcst",
+)
 
 
 def run(command, *, env, cwd=None, timeout=300, text=True, check=False):

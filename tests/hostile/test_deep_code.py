@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("libcst")
 
-from tests.patcher.support import checkout, files
+from tests.patcher.support import checkout, files, legs_patch
 from tests.support import legs_environment
 
 TRAIN = """import torch
@@ -73,15 +73,9 @@ CASES = {
 
 
 def check(root):
-    done = subprocess.run(
-        [sys.executable, "-m", "legs_adapters.cli", "--check", str(root)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env=legs_environment(),
-        timeout=300,
-    )
-    assert b"Traceback" not in done.stdout
-    return done.returncode, done.stdout.decode()
+    done = legs_patch("--check", root)
+    assert "Traceback" not in done.stdout + done.stderr
+    return done.returncode, done.stdout + done.stderr
 
 
 def beside(folder, others):

@@ -165,7 +165,7 @@ def test_transforms(text, line, tmp_path):
 def test_mode_000(tmp_path):
     root = colmap_scene(tmp_path / "scene")
     (root / "sparse" / "0" / "images.bin").chmod(0)
-    done = legs("precompute", root)
+    done = legs("precompute", root, "--workers", 1)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "Permission denied" in done.stderr
 
@@ -279,7 +279,7 @@ def test_an_eps_named_jpg_starts_nothing(tmp_path, ghostscript, monkeypatch):
     photo = tmp_path / "scene" / "photo.jpg"
     save(photo.with_name("real.jpg"), photograph(8, 8))
     photo.write_bytes(EPS)
-    done = legs("precompute", photo.parent, env=dict(legs_environment(), PATH=path))
+    done = legs("precompute", photo.parent, "--workers", 1, env=dict(legs_environment(), PATH=path))
     assert done.returncode != 0
     assert f"{photo}: not an image in a format that is read here (JPEG, PNG," in done.stderr
     assert "Traceback" not in done.stderr

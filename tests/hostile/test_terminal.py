@@ -19,8 +19,7 @@ from tests.support import colmap_scene, legs_command, legs_environment, photogra
 
 def legs_patch(*arguments, encoding):
     command = [sys.executable, "-m", "legs_adapters.cli", *map(str, arguments)]
-    environment = dict(legs_environment(), PYTHONIOENCODING=encoding)
-    return subprocess.run(command, capture_output=True, env=environment, timeout=300)
+    return run(command, env=dict(legs_environment(), PYTHONIOENCODING=encoding), text=False)
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
@@ -104,12 +103,12 @@ class TestLegs:
 
     @pytest.mark.parametrize("encoding", ["ascii", "latin-1:strict", "utf-8"])
     def test_what_is_skipped_and_what_was_written(self, scene, encoding):
-        done = self.legs("precompute", scene, code=1, encoding=encoding)
+        done = self.legs("precompute", scene, "--workers", 1, code=1, encoding=encoding)
         assert b"legs: skipped" in done.stderr and b"1 made, 0 up to date, 1 skipped" in done.stdout
         assert len(WeightStore(scene / "legs_weights").entries) == 1
 
     def test_damage_and_errors(self, scene, tmp_path):
-        self.legs("precompute", scene, code=1)
+        self.legs("precompute", scene, "--workers", 1, code=1)
         for path in (scene / "legs_weights").glob("*.npy"):
             path.write_bytes(b"")
         assert b"damaged    1" in self.legs("info", scene, code=1).stdout

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import threading
 from types import SimpleNamespace
@@ -24,6 +23,7 @@ from legs_loss.spec import PRESETS
 from legs_loss.weights import Weights
 from tests.cuda_emulation import COMPILER, Runtime, libraries
 from tests.kernels.support import images, used
+from tests.preloaded import run
 from tests.support import legs_environment
 
 WEIGHTS = Weights(spec=PRESETS["legs"])
@@ -274,6 +274,6 @@ def test_a_forked_process_uses_both():
     )
     environment = legs_environment()
     environment.pop("LEGS_BACKEND", None)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    done = run([sys.executable, "-c", code], env=environment)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""

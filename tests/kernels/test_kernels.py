@@ -24,6 +24,7 @@ from legs_loss.responses import response
 from legs_loss.scenes.images import image_tensor
 from legs_loss.spec import PRESETS
 from tests.kernels.support import by_signature, compare, images, used
+from tests.preloaded import run
 from tests.support import legs_environment
 
 pytest.importorskip("numba")
@@ -421,5 +422,5 @@ class TestSelection:
             "    os._exit(0 if type(loss.grad_fn).__name__ == '_FusedLossBackward' else 1)\n"
             "assert os.waitpid(child, 0)[1] == 0\n"
         )
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=legs_environment())
+        done = run([sys.executable, "-c", code], env=legs_environment())
         assert done.returncode == 0, done.stderr

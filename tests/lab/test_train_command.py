@@ -23,7 +23,8 @@ from legs_loss.lab.training.trainer import TrainConfig, train
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.system.locks import FileLock
 from tests.lab.training import SHORT, assert_equal, run_until_killed
-from tests.support import colmap_scene
+from tests.preloaded import run
+from tests.support import colmap_scene, legs_environment
 
 pytest.importorskip("numba")
 
@@ -81,8 +82,8 @@ def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
             read_checkpoint(path)
 
 
-def command(*arguments: Any, **more: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(arguments_of(*arguments), env=environment(), capture_output=True, text=True, **more)
+def command(*arguments: Any) -> subprocess.CompletedProcess[str]:
+    return run(arguments_of(*arguments), env=environment())
 
 
 def arguments_of(*arguments: Any) -> List[str]:
@@ -90,9 +91,7 @@ def arguments_of(*arguments: Any) -> List[str]:
 
 
 def environment() -> dict:
-    root = str(Path(__file__).resolve().parents[2])
-    path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
-    return dict(os.environ, PYTHONPATH=path, OMP_NUM_THREADS="1")
+    return legs_environment()
 
 
 def test_legs_train(tiny_scene: Path, tmp_path: Path) -> None:

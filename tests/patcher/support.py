@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 
+from tests.preloaded import run
 from tests.support import ROOT, legs_environment
 
 CASES = ROOT / "tests" / "patching"
@@ -84,7 +85,7 @@ def snapshot(folder):
 
 
 def legs_patch(*arguments, **options):
-    """Run ``legs-patch`` as a real subprocess and return the completed process, with text output."""
-    command = [sys.executable, "-m", "legs_adapters.cli", *map(str, arguments)]
-    options = {"env": legs_environment(), "timeout": 300, **options}
-    return subprocess.run(command, capture_output=True, text=True, **options)
+    """Run ``legs-patch`` in a process of its own and return the completed process, with text output."""
+    return run(
+        [sys.executable, "-m", "legs_adapters.cli", *map(str, arguments)], **{"env": legs_environment(), **options}
+    )

@@ -13,7 +13,8 @@ from PIL import Image
 
 import legs_loss
 from tests.patcher.support import checkout, files, legs_patch, snapshot
-from tests.support import legs_environment
+from tests.preloaded import run
+from tests.support import legs, legs_environment
 
 LINE = "        image = legs_loss.masked(image, gt_image)\n"
 SCRIPT = """
@@ -96,20 +97,12 @@ def scene(tmp_path):
 
 
 def python(*words, **options):
-    done = subprocess.run(
-        [sys.executable, *map(str, words)],
-        env=legs_environment(),
-        capture_output=True,
-        text=True,
-        check=True,
-        **options,
-    )
+    done = run([sys.executable, *map(str, words)], env=legs_environment(), check=True, **options)
     return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")], done.stderr
 
 
 def precompute(scene):
-    command = ["-m", "legs_loss", "precompute", scene, "--masks", "masks", "--workers", "1"]
-    subprocess.run([sys.executable, *map(str, command)], env=legs_environment(), capture_output=True, check=True)
+    assert legs("precompute", scene, "--masks", "masks", "--workers", 1).returncode == 0
 
 
 @pytest.mark.slow

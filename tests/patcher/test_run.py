@@ -14,6 +14,7 @@ import pytest
 
 from legs_loss.lab.embedded import write_embedded_scene
 from tests.patcher.support import checkout, files, legs_patch, snapshot
+from tests.preloaded import run
 from tests.support import legs, legs_environment
 
 
@@ -24,9 +25,19 @@ def scene(tmp_path_factory):
 
 def python(*arguments, cwd, **variables):
     environment = {name: value for name, value in legs_environment().items() if not name.startswith("LEGS_")}
-    command = [sys.executable, *map(str, arguments)]
+    return run([sys.executable, *map(str, arguments)], cwd=cwd, env=dict(environment, **variables))
+
+
+def by_python(*arguments, cwd, **variables):
+    """The same by a Python of its own: what it prints of an error begins there."""
+    environment = {name: value for name, value in legs_environment().items() if not name.startswith("LEGS_")}
     return subprocess.run(
-        command, cwd=str(cwd), env=dict(environment, **variables), capture_output=True, text=True, timeout=300
+        [sys.executable, *map(str, arguments)],
+        cwd=str(cwd),
+        env=dict(environment, **variables),
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
 
 
@@ -126,7 +137,7 @@ class TestAsPythonRunsIt:
         return checkout(root, texts)
 
     def both(self, root, *arguments):
-        return python("-m", "legs_loss", "run", *arguments, cwd=root), python(*arguments, cwd=root)
+        return by_python("-m", "legs_loss", "run", *arguments, cwd=root), by_python(*arguments, cwd=root)
 
     @pytest.mark.parametrize(
         "body",
@@ -174,7 +185,7 @@ class TestAsPythonRunsIt:
         (tmp_path / "train.py").write_text(text, encoding="utf-8")
         (tmp_path / "broken.py").write_text("def f(:\n    pass\n", encoding="utf-8")
         code = "import sys\nfrom legs_adapters.rewritten import execute\nsys.exit(execute(['train.py'], {}))"
-        run, plain = python("-c", code, cwd=tmp_path), python("train.py", cwd=tmp_path)
+        run, plain = by_python("-c", code, cwd=tmp_path), by_python("train.py", cwd=tmp_path)
         assert "SyntaxError" in plain.stderr
         assert (run.returncode, run.stderr) == (plain.returncode, plain.stderr)
 
@@ -209,7 +220,7 @@ class TestAsPythonRunsIt:
         )
         root = checkout(tmp_path, texts)
         before = snapshot(root)
-        done = python("-m", "legs_loss", "run", "train.py", cwd=root)
+        done = by_python("-m", "legs_loss", "run", "train.py", cwd=root)
         assert done.returncode == 0, done.stderr
         assert done.stdout.splitlines()[0] == "2 legs_loss"
         assert snapshot(root) == before
@@ -220,7 +231,7 @@ class TestAsPythonRunsIt:
         texts["run.py"] = "import inspect, slam\nprint(inspect.getsource(slam.tracking), legs_loss.__name__)\n"
         root = checkout(tmp_path, texts)
         before = snapshot(root)
-        done = python("-m", "legs_loss", "run", "run.py", cwd=root)
+        done = by_python("-m", "legs_loss", "run", "run.py", cwd=root)
         assert done.returncode == 0, done.stderr
         assert "loss = legs_loss.unweighted(rgb_loss)(render(" in done.stdout
         assert "slam.py:7 is not weighted in this run" in done.stderr

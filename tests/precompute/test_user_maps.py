@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import struct
-import subprocess
-import sys
 import zlib
 
 import numpy as np
@@ -17,6 +15,7 @@ from legs_loss import LegsError, WeightSpec
 from legs_loss.precompute import UserMaps, precompute
 from legs_loss.scenes import image_tensor, load_training_image, read_scene
 from legs_loss.store import MASK, WEIGHTS, WeightStore
+from tests.support import legs
 
 SPEC = WeightSpec()
 
@@ -325,10 +324,11 @@ class TestAgain:
             mask_of(scene)
 
     def test_the_command(self, scene):
-        command = [sys.executable, "-m", "legs_loss", "precompute", str(scene), "--workers", "1", "--masks", "masks"]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        command = ("precompute", scene, "--workers", 1, "--masks", "masks")
+        done = legs(*command)
+        assert done.returncode == 0
         assert f"{scene}/legs_weights: 1 masks of your own" in done.stdout
         assert "counted whole, without a mask: images/b.png, images/c.png" in done.stderr
         (scene / "masks/a.png").write_bytes(b"")
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = legs(*command)
         assert done.returncode == 2 and done.stderr.count("legs: error:") == 1 and "Traceback" not in done.stderr

@@ -36,6 +36,7 @@ from legs_loss.precompute import UserMaps, precompute
 from legs_loss.scenes import read_scene
 from tests.lab.experiments.support import BASE
 from tests.lab.training import train_one
+from tests.preloaded import PATH, run
 from tests.support import without_times
 
 
@@ -193,15 +194,14 @@ def command(*arguments: Any) -> List[str]:
 
 
 def environment() -> Dict[str, str]:
-    root = str(Path(__file__).resolve().parents[3])
-    return dict(os.environ, PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])))
+    return dict(os.environ, PYTHONPATH=PATH)
 
 
 def test_the_command(tiny_scene: Path, tmp_path: Path) -> None:
     before = sorted(tiny_scene.rglob("*"))
     arguments = command("compare", tiny_scene, "--out", tmp_path / "out", "--iterations", 20, "-r", 2, "--seeds", 2)
     arguments += ["--processes", "2", "--arms", "legs", "legs@3dgs"]
-    done = subprocess.run(arguments, env=environment(), capture_output=True, text=True, encoding="utf-8")
+    done = run(arguments, env=environment())
     assert done.returncode == 0, done.stderr
     assert sorted(tiny_scene.rglob("*")) == before
     assert "The baseline is unweighted: over 10 views" in done.stdout
@@ -210,7 +210,7 @@ def test_the_command(tiny_scene: Path, tmp_path: Path) -> None:
     assert len(rows) == 6
     assert markdown(*scores_table(rows, ["3dgs", "legs", "legs@3dgs"])) in done.stdout
     assert "Too short to decide: 20 iterations" in done.stdout and "legs − 3dgs" not in done.stdout
-    again = subprocess.run(arguments, env=environment(), capture_output=True, text=True, encoding="utf-8")
+    again = run(arguments, env=environment())
     assert again.returncode == 0
     assert "0 of 6 trainings to do" in again.stdout
 
@@ -249,7 +249,7 @@ def test_killed_it_goes_on(tiny_scene: Path, tmp_path: Path) -> None:
             time.sleep(0.05)
         process.kill()
         process.wait()
-    done = subprocess.run(arguments, env=environment(), capture_output=True, text=True, encoding="utf-8")
+    done = run(arguments, env=environment())
     assert done.returncode == 0, done.stderr
     assert "1 of 2 trainings to do" in done.stdout
     assert b"Traceback" not in (tmp_path / "stderr").read_bytes()

@@ -7,6 +7,8 @@ scoring and every other L1 are not changed. Writes legs.toml to FOLDER, and a jo
 from __future__ import annotations
 
 import argparse
+import atexit
+import gc
 import json
 import os
 import shlex
@@ -163,6 +165,7 @@ def _patch(args: argparse.Namespace) -> int:
 
     if not args.trace and (args.cpu or args.photos):
         raise LegsError('--cpu and --photos belong to --trace "SCRIPT ARGUMENTS"')
+    atexit.register(gc.freeze)  # at its end the process frees all memory at once: no tree is looked at again
     root = check_root(args.folder)
     settings = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
     text = settings_text(root, settings)

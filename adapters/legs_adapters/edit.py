@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import re
 import sys
-import warnings
 from typing import List, Optional, Sequence
 
 import libcst as cst
 
 from legs_adapters.code.module import Module
+from legs_adapters.code.parsing import read_by_python
 from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import dotted
 from legs_adapters.terms.findings import Site, Use
@@ -43,6 +43,7 @@ def rewrite(
 
     Raises:
         LegsError: the file has a legs_loss of its own; or the result would not compile (a bug of legs-patch).
+        ValueError: this Python cannot compile the file, or it cannot be written back exactly.
     """
     source, module = program.sources[path], program.module(path)
     assert module is not None
@@ -59,19 +60,16 @@ def rewrite(
     edits.sort()
     why = why_not_compiled(apply_edits(source.data, edits))
     if why:
-        raise LegsError(f"{path}: rewritten, {why}; please report this")
+        before = why_not_compiled(source.data)
+        raise ValueError(before) if before else LegsError(f"{path}: rewritten, {why}; please report this")
     return edits
 
 
 def why_not_compiled(data: bytes) -> str:
     """Return why this Python cannot compile a file, or "": LibCST also reads syntax of other versions."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            compile(data, "file", "exec", dont_inherit=True)
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        return f"Python {sys.version_info[0]}.{sys.version_info[1]} cannot compile it: {error}"
-    return ""
+    made = read_by_python(data, flags=0)
+    version = ".".join(map(str, sys.version_info[:2]))
+    return f"Python {version} cannot compile it: {made}" if isinstance(made, Exception) else ""
 
 
 def _import(text: Text) -> Edit:

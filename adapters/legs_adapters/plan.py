@@ -13,7 +13,7 @@ from legs_adapters.checkout.git import changed_files
 from legs_adapters.checkout.replace import Changes, locked, read_file, replace_files
 from legs_adapters.code.folders import first_of, why_left_out
 from legs_adapters.code.sources import Unreadable, check_root, read_files
-from legs_adapters.edit import rewrite, why_not_compiled
+from legs_adapters.edit import rewrite
 from legs_adapters.journal import JOURNAL, Journal, Layer, digest
 from legs_adapters.rules.find import find
 from legs_adapters.settings import SETTINGS_FILE
@@ -77,6 +77,8 @@ def _large_trees() -> Iterator[None]:
     finally:
         sys.setrecursionlimit(before)
         if collects:
+            gc.freeze()
+            gc.unfreeze()  # to the oldest generation: the trees outlive this, and are not looked at for what is new
             gc.enable()
 
 
@@ -105,24 +107,9 @@ def plan(
     """
     root = check_root(path)
     readable, unreadable = read_files(root, exclude)
-    edits: Dict[str, List[Edit]] = {}
     with _large_trees():
         findings = find(readable, by_hand, ssim, masks, trace)
-        for name in _files_to_edit(findings):
-            why = why_not_compiled(findings.program.sources[name].data)
-            if why:
-                _give_up(findings, name, why)
-        for name in _files_to_edit(findings):
-            sites = [site for site in findings.sites if site.path == name]
-            unweighted = [use for use, _ in findings.unweighted if use.caller.module.path == name]
-            try:
-                edits[name] = rewrite(findings.program, name, sites, unweighted, in_place)
-            except RecursionError:
-                _give_up(findings, name, "is nested too deeply")
-            except LegsError:
-                raise
-            except ValueError as error:
-                _give_up(findings, name, f"cannot be written back exactly: {error}")
+        edits = _edits(findings, in_place)
         elsewhere = tuple(unsearched(root, findings.program.budget, exclude))
     findings.unreadable[:0] = unreadable
     for name, line in by_hand:
@@ -143,14 +130,28 @@ def _check_named(root: Path, findings: Findings, name: str, line: int, exclude: 
     raise LegsError(f"{name}:{line}: {why}")
 
 
-def _files_to_edit(findings: Findings) -> List[str]:
-    return sorted({site.path for site in findings.sites} | {use.caller.module.path for use, _ in findings.unweighted})
-
-
-def _give_up(findings: Findings, name: str, why: str) -> None:
-    """Leave a file out that was found in, and report it as not read."""
-    findings.without([name])
-    findings.unreadable.append(Unreadable(name, why))
+def _edits(findings: Findings, in_place: bool) -> Dict[str, List[Edit]]:
+    """Return the edits of each file. One that cannot be edited is given up, and the others are edited without it."""
+    edits: Dict[str, List[Edit]] = {}
+    uses = [use for use, _ in findings.unweighted]
+    for name in sorted({site.path for site in findings.sites} | {use.caller.module.path for use in uses}):
+        sites = [site for site in findings.sites if site.path == name]
+        unweighted = [use for use in uses if use.caller.module.path == name]
+        try:
+            edits[name] = rewrite(findings.program, name, sites, unweighted, in_place)
+            continue
+        except RecursionError:
+            why = "is nested too deeply"
+        except LegsError:
+            raise
+        except ValueError as error:
+            why = str(error)
+        findings.without([name])
+        if any(use.caller.module.path == name for use, _ in findings.unweighted):
+            raise LegsError(f"{name} calls what is weighted, and cannot be edited (it {why}): skip it with --exclude")
+        findings.unreadable.append(Unreadable(name, why))
+        return _edits(findings, in_place)
+    return edits
 
 
 def write(plan: Plan, force: bool = False) -> List[str]:

@@ -250,6 +250,12 @@ self.x, a = 1, 2
     a,
     self.x,
 ) = 1, 2
+(
+    a,
+    self.x[0]
+) = 1, 2
+(self.x,\r
+ a) = 1, 2
 a = self.x = 1
 self.x.append(1)
 self.x.update({1: 2})

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from typing import Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, TypeVar
+from typing import Callable, Dict, FrozenSet, Iterable, Iterator, List, Optional, Sequence, Tuple, TypeVar
 
 import libcst as cst
 
-from legs_adapters.code.flow import Flow
+from legs_adapters.code.flow import MUTATORS, Flow
 from legs_adapters.code.limits import Budget, over_the_limits, parsing_steps, remembered
 from legs_adapters.code.parsing import STUB, Lines, Part, Place, body_part, outline_part, read_by_python
 from legs_adapters.code.reaching import Definition
@@ -18,6 +18,13 @@ CALLED = ("forward", "__call__")  # what calling an instance runs: a torch modul
 
 _T = TypeVar("_T")
 _WORD = re.compile(r"\w+(?:\s*\()?")  # a word, and whether it is called
+# Neither called nor read through an attribute, and behind it an assignment, an ``in``, a colon or a line that goes on.
+_STORED = re.compile(
+    rf"self\.(\w+)(?:(?=\.(?:{'|'.join(sorted(MUTATORS))}|\w+_)[ \t]*\()|(?!\w|[ \t]*[.(])"
+    r"(?=(?:[^\n]{0,400}(?:[^=!<>]|<<|>>))?=(?!=)|[^\n]{0,400}\bin\b|[^\n)[]{0,400}:"
+    r"|[^\n)]{0,400}(?:[,([\\]\s*(?:#[^\n]*)?$|\n\s*[])])))",
+    re.M,
+)
 _DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
 
@@ -67,6 +74,12 @@ class Function:
                 before = self.module.lines.place(self._cut.start, self._cut.start).line - 2
                 self.module.failure = _failure(self.module.path, self.module.text, error, before)
         return self.node if isinstance(self.node, cst.Module) else self.node.body
+
+    @property
+    @remembered
+    def stored(self) -> FrozenSet[str]:
+        """The attributes of ``self`` that its text may store: for those that it only reads it is not parsed."""
+        return frozenset(_STORED.findall(self.text))
 
     @property
     @remembered
@@ -141,9 +154,8 @@ class Class:
 
     def stores(self, attribute: str, where: Callable[[Function], bool] = bool) -> List[Tuple[Function, Definition]]:
         """Return what its methods (those of which ``where`` is true) assign to ``self.attribute``."""
-        place = f"self.{attribute}"
-        methods = [method for method in self.methods.values() if place in method.text and where(method)]
-        found = [(method, d) for method in methods for d in method.flow.definitions.get(place, ())]
+        methods = [method for method in self.methods.values() if attribute in method.stored and where(method)]
+        found = [(method, d) for method in methods for d in method.flow.definitions.get(f"self.{attribute}", ())]
         # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
         return [(method, made) for method, made in found if not str(made.key).startswith(".")]
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import ast
 import bisect
-import contextlib
 import itertools
 import re
 import warnings
 from dataclasses import dataclass, field
-from typing import Dict, Iterator, List, NamedTuple, Optional, Tuple
+from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Tuple
 
 import libcst as cst
 from libcst._nodes.internal import CodegenState
@@ -67,6 +66,7 @@ class _TokenCount(CodegenState):
 
     spans: Dict[int, Tuple[int, int]] = field(default_factory=dict)
     _starts: List[int] = field(default_factory=list)
+    _open: List[Any] = field(default_factory=list)
 
     def before_codegen(self, node: cst.CSTNode) -> None:
         self._starts.append(len(self.tokens))
@@ -74,13 +74,16 @@ class _TokenCount(CodegenState):
     def after_codegen(self, node: cst.CSTNode) -> None:
         self.spans.setdefault(id(node), (self._starts.pop(), len(self.tokens)))
 
-    @contextlib.contextmanager
-    def record_syntactic_position(
-        self, node: cst.CSTNode, *, start_node: Optional[cst.CSTNode] = None, end_node: Optional[cst.CSTNode] = None
-    ) -> Iterator[None]:
-        here = len(self.tokens)
-        yield
-        start = here if start_node is None else self.spans[id(start_node)][0]
+    def record_syntactic_position(self, node: Any, *, start_node: Any = None, end_node: Any = None) -> Any:
+        self._open.append((len(self.tokens), node, start_node, end_node))
+        return self
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        start, node, start_node, end_node = self._open.pop()
+        start = start if start_node is None else self.spans[id(start_node)][0]
         self.spans[id(node)] = start, len(self.tokens) if end_node is None else self.spans[id(end_node)][1]
 
 
@@ -90,16 +93,15 @@ class Part:
     Attributes:
         tree: what was parsed.
         text: what it was parsed from.
-        shift: how many bytes further it stands in the file.
     """
 
     def __init__(self, lines: Lines, text: bytes, shift: int = 0) -> None:
         self.text: bytes = _FORM_FEED.sub(lambda found: b"#" * len(found.group()), text)
         self.tree: cst.Module = cst.parse_module(self.text.decode("utf-8"))
-        self.shift = shift
         self._lines = lines
-        self._spans: Dict[int, Tuple[int, int]] = {}  # by a node's id: of the tokens that LibCST writes
-        self._starts: List[int] = []  # the byte at which each of them starts, and the end
+        self._writing = _TokenCount(self.tree.default_indent, self.tree.default_newline)
+        self._starts: List[int] = [shift]  # the byte at which each token starts, and the end
+        self._unwritten: Iterator[cst.CSTNode] = itertools.chain(self.tree.header, self.tree.body)
 
     def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
         """Return the place of a node in the file, on request with the brackets around it.
@@ -107,24 +109,28 @@ class Part:
         Raises:
             ValueError: LibCST would write another text than it read.
         """
-        if not self._spans:
-            writing = _TokenCount(self.tree.default_indent, self.tree.default_newline)
-            with held_back():  # in there LibCST would make a KeyError of Ctrl-C
-                self.tree._codegen(writing)
-            written = "".join(writing.tokens).encode(self.tree.encoding)
-            if written != self.text:
-                pairs = enumerate(zip(written, self.text))
-                at = self.shift + next((i for i, (one, other) in pairs if one != other), len(self.text) - 1)
-                line = self._lines.place(at, at).line
-                raise ValueError(f"LibCST would write line {line} in another way")
-            lengths = (len(token.encode()) for token in writing.tokens)
-            self._starts = list(itertools.accumulate(itertools.chain([self.shift], lengths)))
-            self._spans = writing.spans
-        start, end = (self._starts[i] for i in self._spans[id(node)])
+        while id(node) not in self._writing.spans:
+            self._write(next(self._unwritten))
+        start, end = (self._starts[i] for i in self._writing.spans[id(node)])
         if brackets and isinstance(node, cst.BaseExpression):
             start -= sum(len(code(part).encode()) for part in node.lpar)
             end += sum(len(code(part).encode()) for part in node.rpar)
         return self._lines.place(start, end)
+
+    def _write(self, statement: cst.CSTNode) -> None:
+        """Let LibCST write the next statement, and compare it with what was read."""
+        with held_back():  # in there LibCST would make a KeyError of Ctrl-C
+            statement._codegen(self._writing)
+        tokens = [token.encode() for token in self._writing.tokens[len(self._starts) - 1 :]]
+        at, written = self._starts[-1], b"".join(tokens)
+        start = at - self._starts[0]
+        read = self.text[start : start + len(written)]
+        # Where the last line has no end, LibCST writes one.
+        if written not in (read, read + self.tree.default_newline.encode()):
+            at += next((i for i, (one, other) in enumerate(zip(written, read)) if one != other), len(read))
+            line = self._lines.place(at, at).line
+            raise ValueError(f"cannot be written back exactly: LibCST would write line {line} in another way")
+        self._starts[-1:] = itertools.accumulate(itertools.chain([at], map(len, tokens)))
 
 
 def outline_part(lines: Lines) -> Tuple[Part, List[Optional[slice]]]:
@@ -157,12 +163,12 @@ def body_part(lines: Lines, cut: slice) -> Part:
     return Part(lines, header + lines.data[cut], cut.start - len(header))
 
 
-def read_by_python(data: bytes) -> ast.AST | Exception:
-    """Return a file as this Python parses it, or the error: it is newer, or deeper than its parser goes."""
+def read_by_python(data: bytes, flags: int = ast.PyCF_ONLY_AST) -> Any:
+    """Return a file as this Python parses or compiles it, or the error: it is newer, or deeper than its parser goes."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return ast.parse(data)
+            return compile(data, "file", "exec", flags, dont_inherit=True)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         return error
 

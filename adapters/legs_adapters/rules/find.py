@@ -99,7 +99,7 @@ class _Search:
             try:
                 self._module(module)
             except ValueError as error:
-                program.give_up(module.path, f"cannot be written back exactly: {error}")
+                program.give_up(module.path, str(error))
             except RecursionError:
                 program.give_up(module.path, "is nested too deeply")
         found.without(program.unreadable)

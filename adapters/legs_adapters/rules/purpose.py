@@ -98,9 +98,9 @@ class Purposes:
             return Evidence("no-step", "scoring", first)
         if steps and all(map(_are_poses, moved)):
             return Evidence("pose-step", "tracking", first)
-        if steps and not any(some & MODELS for some in moved) and self._draws_a_model(function, 0):
-            return Evidence("other-step", "tracking", first) if all(map(self._is_beside, steps)) else None
-        return None
+        is_other = steps and not any(some & MODELS for some in moved) and all(map(self._is_beside, steps))
+        # What is drawn is asked last: it reads much that nothing else does.
+        return Evidence("other-step", "tracking", first) if is_other and self._draws_a_model(function, 0) else None
 
     def _after(self, function: Function, node: cst.CSTNode) -> Tuple[Optional[cst.Call], List[_Step]]:
         """Return the steps after the backward pass of an expression; and that pass, where none follows it."""

@@ -20,10 +20,10 @@ class AbsoluteValue(NamedTuple):
 
 def absolute_value(node: cst.Call) -> Optional[AbsoluteValue]:
     """Return the absolute value that a call takes, or takes the mean of; None for any other call."""
-    inner = mean_of(node)
-    call = node if inner is None else inner
+    averaged = _argument(node, "mean")  # over all axes
+    call = averaged if isinstance(averaged, cst.Call) else node
     argument = abs_argument(call)
-    return None if argument is None else AbsoluteValue(call, argument, "none" if inner is None else "mean")
+    return None if argument is None else AbsoluteValue(call, argument, "none" if call is node else "mean")
 
 
 def is_difference(node: Optional[cst.CSTNode]) -> bool:
@@ -35,12 +35,6 @@ def is_no_picture(node: cst.CSTNode) -> bool:
     """Return whether an expression is ``abs(a - b)``, or one value for every pixel: ``torch.zeros_like(a)``."""
     is_constant = isinstance(node, cst.Call) and call_name(node) in CONSTANTS
     return is_constant or is_difference(abs_argument(node))
-
-
-def mean_of(node: cst.Call) -> Optional[cst.Call]:
-    """Return the call ``x`` of ``x.mean()`` or ``torch.mean(x)``: the mean over all axes, without further arguments."""
-    averaged = _argument(node, "mean")
-    return averaged if isinstance(averaged, cst.Call) else None
 
 
 def abs_argument(node: cst.CSTNode) -> Optional[cst.BaseExpression]:

@@ -70,6 +70,18 @@ def test_the_patched_files_compile_and_a_second_patch_finds_nothing(name, tmp_pa
     assert plan(tmp_path, **options(name)).after == {}
 
 
+def test_a_checkout_without_a_word_of_gaussians_has_no_term_to_decide(tmp_path):
+    text = "import torch\n\n\ndef train(net, data, optimizer):\n    for image, gt_image in data:\n"
+    text += (
+        "        loss = torch.abs(net(image) - gt_image).mean()\n        loss.backward()\n        optimizer.step()\n"
+    )
+    found = plan(checkout(tmp_path, {"nets/train.py": text})).findings
+    assert [entry.rule for entry in found.left] == ["not-splats"]
+    assert not found.problems
+    found = plan(checkout(tmp_path, {"scene/model.py": "gaussian_model = None\n"})).findings
+    assert [problem.line for problem in found.problems] == [6]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_in_place_every_line_keeps_its_number(name, tmp_path):
     root = checkout(tmp_path, files(name))

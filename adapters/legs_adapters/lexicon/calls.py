@@ -95,17 +95,22 @@ def _number(call: CallReading) -> Optional[Meaning]:
 
 
 def _reduced(call: CallReading) -> Optional[Meaning]:
-    """A number of the whole image, or one a channel; the brightest pixel, or the brightest channel of each: a prior."""
+    """A number of the whole image, or one a channel; the grey picture; the brightest pixel or channel: a prior."""
     of = call.owner or next(iter(call.positional), None)
     positional = call.positional if call.owner is not None else call.positional[1:]
     axes = [*positional, *(value for name, value in call.keywords.items() if name in ("dim", "axis"))]
     if call.name in REDUCES and all(isinstance(constant(axis), tuple) for axis in axes):
         return Meaning("parameter", None)
-    if call.name not in EXTREMES or of is None:
+    made = of and (call.function.flow.value_of(of) or of)
+    is_joined = isinstance(made, cst.Call) and call_name(made) in JOINS  # the mean of several pictures
+    is_grey = call.name in REDUCES and constant(call.keywords.get("keepdim")) and not is_joined
+    if of is None or not (is_grey or call.name in EXTREMES):
         return None
     meaning = call.ask(of)
     by_axis = "dim" in call.keywords or any(isinstance(constant(axis), int) for axis in axes)
-    return meaning._replace(kind="parameter") if meaning.kind == "image" and by_axis else meaning
+    return (
+        meaning._replace(kind="feature" if is_grey else "parameter") if meaning.kind == "image" and by_axis else meaning
+    )
 
 
 def _filtered(call: CallReading) -> Optional[Meaning]:

@@ -51,7 +51,7 @@ class Training:
         self._scoring: Optional[Tuple[Function, cst.Call]] = None  # the call from which the slice begins now
         self._touched: Set[Function] = set()
         self._met: Set[Tuple[Function, int]] = set()  # what ``sites`` has
-        self._begun: Set[Reaching] = set()
+        self._begun: Set[Function] = set()  # those in which the slice begins
         self._done: Set[Tuple[int, object]] = set()
         self._work: List[Tuple[Function, cst.CSTNode | Reaching, object]] = []
         scoring: List[Tuple[Function, cst.Call]] = []
@@ -123,12 +123,9 @@ class Training:
     def _begin(self, function: Function, values: Sequence[cst.CSTNode], is_root: bool) -> None:
         if is_root and function not in self.roots:
             self.roots.append(function)
+        self._begun.update([function] if values else [])
         for value in values:
             self._push(function, value)
-            for definition in function.flow.reaching(value).new(self._begun):  # def step(loss): loss.backward()
-                if definition.kind == "parameter" and definition.place in function.parameters:
-                    for caller, given in given_to(self.program, function, definition.place):
-                        self._push(caller, given)
 
     def _push(self, function: Function, node: Optional[cst.CSTNode | Reaching], key: object = _ANY) -> None:
         mark = (id(node), key if isinstance(key, (str, int)) else _ANY)
@@ -219,6 +216,9 @@ class Training:
                 self._push(function, part, key)
             return
         value, kind = definition.value, definition.kind
+        is_given = kind == "parameter" and definition.place in function.parameters and function in self._begun
+        for caller, given in given_to(self.program, function, definition.place) if is_given else ():
+            self._push(caller, given, key)  # def step(losses): sum(losses.values()).backward()
         if kind == "store":
             if definition.key in (None, key) or key is _ANY:
                 self._push(function, value)

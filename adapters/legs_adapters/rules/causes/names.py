@@ -106,7 +106,7 @@ class OtherName(Rule):
 
 NAMES = (
     OtherName("warping", "synthetic", WARPED, "A name says that one view is warped into another.", "reprojection"),
-    OtherName("perceptual", "features", PERCEPTUAL, "A name is of a perceptual loss, which compares features.", "vgg"),
+    OtherName("perceptual", "features", PERCEPTUAL, "A name is of a perceptual loss, perhaps of features.", "vgg"),
     OtherName("mesh", "mesh", MESH, "A name is of a mesh: nothing proves that Gaussians are drawn.", "train_texture"),
     OtherName("robust", "huber", ROBUST, "A name is of a robust loss: a weight may move its threshold.", "huber"),
 )

@@ -6,7 +6,7 @@ import functools
 import re
 from typing import List
 
-from legs_adapters.lexicon.words import RAYS
+from legs_adapters.lexicon.words import RAYS, SPLATS
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import of_rays
@@ -36,7 +36,8 @@ class NotSplats(Rule):
         return term.here if of_rays(term.form) and not term.has_rows else []  # pixels of an image, by that name
 
     def may_be_loss(self, term: Term) -> bool:
-        return RAYS.search(term.function.module.text) is None
+        sources = term.analysis.program.sources.values()
+        return RAYS.search(term.function.module.text) is None and any(SPLATS.search(each.text) for each in sources)
 
 
 @functools.lru_cache(maxsize=8)

@@ -164,8 +164,18 @@ LABORIOUS = {
 }
 
 
-@pytest.mark.parametrize("options", ["", "ssim=True, masks=True"], ids=["plain", "ssim and masks"])
-@pytest.mark.parametrize("what", LABORIOUS, ids=lambda what: what.replace(" ", "_"))
+# Of what takes seconds, the harder of both ways: --ssim and --masks read all that is read without them.
+LONG = {"1,000 functions", "1,800 loops", "1,200 try", "2,520 functions"}
+
+
+@pytest.mark.parametrize(
+    ("what", "options"),
+    [
+        pytest.param(what, options, marks=[pytest.mark.slow] * (what in LONG and not options), id=f"{what}-{options}")
+        for what in LABORIOUS
+        for options in ("", "ssim=True, masks=True")
+    ],
+)
 def test_the_steps_are_few(what, options, tmp_path):
     """Steps are counted, not timed: the same files are read on any machine, in little memory."""
     text, is_read = LABORIOUS[what]

@@ -279,12 +279,12 @@ def legs_patch_here(*arguments):
 
 @pytest.mark.parametrize("what", ARGUMENTS)
 class TestAtAnyLine:
-    """Some 30 of the lines, evenly; all of them are too many for every run."""
+    """Some 20 of the lines, evenly, and each third operation on files; all of them are too many for every run."""
 
     def points(self, tmp_path, what):
         count = lines_of([*ARGUMENTS[what], prepared(tmp_path / "count", what)])
         assert count > 100
-        for number in range(4, count + 1, max(1, count // 30)):
+        for number in range(4, count + 1, max(1, count // 20)):
             yield number, prepared(tmp_path / str(number), what)
 
     def test_ctrl_c_says_what_is_true(self, what, tmp_path):
@@ -304,7 +304,7 @@ class TestAtAnyLine:
         """A real signal before each: the lock and the staging folder go, whatever stage it comes at."""
         saids, number = [], -1
         while not saids or saids[-1].partition(" ")[0] == "130":
-            number += 2  # every second one
+            number += 3
             root = prepared(tmp_path / str(number), what)
             before = snapshot(root)
             saids.append(interrupted([*ARGUMENTS[what], root], root, number))

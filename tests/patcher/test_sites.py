@@ -21,10 +21,16 @@ def changed_lines(found, path):
     return [line for line in lines if not line.startswith("import legs_loss") and not MASKS.match(line)]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_term_gets_the_verdict_that_its_comment_asks_for(name, tmp_path):
-    texts = files(name)
-    found = plan(checkout(tmp_path, texts), **options(name))
+@pytest.fixture(scope="module", params=NAMES)
+def case(request, tmp_path_factory):
+    """A script's name, its files, its checkout, which stays as it is, and its plan."""
+    texts = files(request.param)
+    root = checkout(tmp_path_factory.mktemp("case"), texts)
+    return request.param, texts, root, plan(root, **options(request.param))
+
+
+def test_every_term_gets_the_verdict_that_its_comment_asks_for(case):
+    _, texts, _, found = case
     verdicts = {}
     for site in (site for site in found.findings.sites if site.form.term != "mask"):
         becomes = "fused" if site.form.term else "weighted"
@@ -61,13 +67,11 @@ def test_the_line_of_masks_is_written_where_its_comment_says(name, tmp_path):
     assert written == expected(texts, masked=True)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_patched_files_compile_and_a_second_patch_finds_nothing(name, tmp_path):
-    found = plan(checkout(tmp_path, files(name)), **options(name))
+def test_the_patched_files_compile_and_a_second_patch_finds_nothing(case, tmp_path):
+    name, texts, _, found = case
     for path, data in found.after.items():
         compile(data, path, "exec")
-        (tmp_path / path).write_bytes(data)
-    assert plan(tmp_path, **options(name)).after == {}
+    assert plan(checkout(tmp_path, {**texts, **found.after}), **options(name)).after == {}
 
 
 def test_a_checkout_without_a_word_of_gaussians_has_no_term_to_decide(tmp_path):
@@ -82,10 +86,9 @@ def test_a_checkout_without_a_word_of_gaussians_has_no_term_to_decide(tmp_path):
     assert [problem.line for problem in found.problems] == [6]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_in_place_every_line_keeps_its_number(name, tmp_path):
-    root = checkout(tmp_path, files(name))
-    here, on_disk = (plan(root, in_place=in_place, **options(name)) for in_place in (True, False))
+def test_in_place_every_line_keeps_its_number(case):
+    name, _, root, on_disk = case
+    here = plan(root, in_place=True, **options(name))
     assert sorted(here.after) == sorted(on_disk.after)
     for path, data in here.after.items():
         before = (root / path).read_bytes()

@@ -30,15 +30,32 @@ _MEMORYLESS = [
 ]
 
 
+def is_differentiated() -> bool:
+    """Return whether torch.func or forward-mode AD is around, also of a graph that is being compiled."""
+    return forward_ad._current_level >= 0 or (_levels is not None and _levels() is not None)
+
+
+def is_in_a_node() -> bool:
+    """Return whether this runs in the forward pass of an autograd.Function that becomes a node of a graph."""
+    frame = None if torch.is_grad_enabled() else sys._getframe(1)
+    while frame is not None:
+        code = frame.f_code
+        if code.co_name == "forward" and code.co_argcount:
+            context = frame.f_locals.get(code.co_varnames[0])
+            # It has none where the graph does not get this node.
+            if isinstance(context, torch.autograd.function.FunctionCtx) and getattr(context, "next_functions", None):
+                return True
+        frame = frame.f_back
+    return False
+
+
 def is_transformed() -> bool:
     """Return whether torch.func, forward-mode AD or a recording (torch.jit.trace, make_fx) sees what is computed now.
 
     Then tensors may have no memory to read, and what is computed is valid until the transform ends: torch computes it,
     and nothing is looked up or kept.
     """
-    if forward_ad._current_level >= 0 or torch._C._get_tracing_state() is not None:
-        return True
-    if _levels is not None and _levels() is not None:
+    if is_differentiated() or torch._C._get_tracing_state() is not None:
         return True
     return _modes is not None and _modes() > 0 and (None in _MEMORYLESS or any(map(_mode_of, _MEMORYLESS)))
 
@@ -53,7 +70,7 @@ def is_trained(image: Tensor) -> bool:
     if is_compiling():
         return False
     if not is_transformed():
-        return not torch.is_grad_enabled() and _in_a_node()
+        return is_in_a_node()
     while True:  # each transform wraps the tensor of the one outside it
         batched = _functorch is not None and _functorch.is_batchedtensor(image)
         if image.requires_grad and torch.is_grad_enabled():
@@ -63,20 +80,6 @@ def is_trained(image: Tensor) -> bool:
         if _functorch is None or not _functorch.is_functorch_wrapped_tensor(image):
             return False
         image = _functorch.get_unwrapped(image)
-
-
-def _in_a_node() -> bool:
-    """Return whether this runs in the forward pass of an autograd.Function that becomes a node of a graph."""
-    frame = sys._getframe(1)
-    while frame is not None:
-        code = frame.f_code
-        if code.co_name == "forward" and code.co_argcount:
-            context = frame.f_locals.get(code.co_varnames[0])
-            # It has none where the graph does not get this node.
-            if isinstance(context, torch.autograd.function.FunctionCtx) and getattr(context, "next_functions", None):
-                return True
-        frame = frame.f_back  # type: ignore[assignment]
-    return False
 
 
 def check_order(prediction: Tensor, target: Tensor) -> None:

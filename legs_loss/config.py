@@ -10,14 +10,13 @@ import sys
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional, Tuple
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
 
 from legs_loss.errors import LegsError, did_you_mean
 from legs_loss.spec import PRESETS, WeightSpec, as_spec
 
 CONFIG_FILE = "legs.toml"
 STORE_FOLDER = "legs_weights"
-_DEFAULTS = "defaults"
 
 # The keys of legs.toml, and in capitals the variables LEGS_*. The preset is the first: the others change it.
 _SETTINGS = ("preset", "store", *(field.name for field in fields(WeightSpec)))
@@ -48,13 +47,8 @@ class Config:
     store: Optional[Path] = None
     off: bool = False
     require_masks: bool = False
-    source: str = _DEFAULTS
+    source: str = "defaults"
     notes: Tuple[str, ...] = ()
-
-    @property
-    def active(self) -> bool:
-        """Return whether any weight is applied."""
-        return not self.off and not self.spec.unweighted
 
 
 def find_config(
@@ -112,14 +106,11 @@ def is_off(environ: Optional[Mapping[str, str]] = None) -> bool:
 
 
 def _apply(config: Config, settings: Dict[str, Any], where: str, base: Path) -> Config:
-    if not settings:
-        return config
     settings = dict(settings)
     try:
         for key in settings:
             if key not in _SETTINGS:
-                known = ", ".join(_SETTINGS)
-                raise LegsError(f"unknown setting {key!r}; there are {known}{did_you_mean(key, _SETTINGS)}")
+                raise LegsError(f"unknown setting {key!r}; there are {', '.join(_SETTINGS)}{_meant(key, _SETTINGS)}")
         preset = settings.pop("preset", None)
         if preset is not None and not isinstance(preset, str):
             raise LegsError(f"preset must be a text, got {repr(preset)[:100]}")
@@ -133,7 +124,7 @@ def _apply(config: Config, settings: Dict[str, Any], where: str, base: Path) -> 
         spec=spec,
         preset=config.preset if preset is None else preset,
         store=config.store if store is None else store,
-        source=where if config.source == _DEFAULTS else f"{config.source}, {where}",
+        source=where if config.source == Config.source else f"{config.source}, {where}",
     )
 
 
@@ -163,13 +154,19 @@ def _store(value: Any, base: Path) -> Optional[Path]:
 
 
 def _unknown_variables(environ: Mapping[str, str]) -> Tuple[str, ...]:
-    known = ["LEGS_" + name.upper() for name in (*_SETTINGS, *_OTHER_VARIABLES)]
+    known = [name.upper() for name in (*_SETTINGS, *_OTHER_VARIABLES)]
     return tuple(
-        f"environment variable {name} is not known and has no effect"
-        + (_LAMBDA if "LAMBDA" in name else did_you_mean(name, known))
-        for name in sorted(environ)
-        if name.startswith("LEGS_") and name not in known and not name.startswith("LEGS_TEST")
+        f"environment variable LEGS_{name} is not known and has no effect{_meant(name, known, 'LEGS_')}"
+        for name in sorted(variable[len("LEGS_") :] for variable in environ if variable.startswith("LEGS_"))
+        if name not in known and not name.startswith("TEST")
     )
+
+
+def _meant(name: str, known: Sequence[str], prefix: str = "") -> str:
+    """Return the end of a message on an unknown setting."""
+    if "lambda" in name.lower():
+        return _LAMBDA
+    return did_you_mean(name, known).replace("'", f"'{prefix}", 1)
 
 
 def _find_file(start: Path) -> Optional[Path]:
@@ -204,10 +201,8 @@ def _read_toml(path: Path) -> Dict[str, Any]:
 
     try:
         return tomllib.loads(read_text(path, _LARGEST))
-    except OSError as error:
-        raise LegsError(f"{path} cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # everything that a TOML parser raises, for numbers and texts too
-        raise LegsError(f"{path} cannot be read: {error}") from None
+    except (OSError, ValueError, RecursionError) as error:  # a TOML parser raises the last two
+        raise LegsError(f"{path} cannot be read: {getattr(error, 'strerror', error)}") from None
 
 
 def _store_of_scene(argv: List[str]) -> Optional[Path]:

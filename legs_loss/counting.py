@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import atexit
+import os
 import sys
 from dataclasses import dataclass
-from typing import Set
+from multiprocessing import util
+from typing import Any, Callable, Set
 
 from legs_loss.system.terminal import is_first_process, say
 
@@ -70,10 +72,7 @@ def _took_gradients() -> bool:
     if counted.weighted or counted.plain_steps or counted.graphs:
         return True
     torch = sys.modules.get("torch")
-    if torch is None or not hasattr(torch, "optim"):
-        return False
-    nodes = getattr(getattr(torch._C, "_autograd", None), "_get_sequence_nr", None)
-    if nodes is not None and nodes() == 0:
+    if torch is None or not hasattr(torch, "optim") or _nodes() == _begun:
         return False
     made, kinds = False, [torch.optim.Optimizer]
     while kinds and not made:  # torch marks the class of an optimiser that is made
@@ -83,7 +82,39 @@ def _took_gradients() -> bool:
     return made
 
 
-@atexit.register
+_begun = 0  # what _nodes() returned as the process began
+
+
+def _nodes() -> int:
+    """Return how many nodes autograd has made, -1 where it does not say."""
+    autograd: Any = getattr(getattr(sys.modules.get("torch"), "_C", None), "_autograd", None)
+    return getattr(autograd, "_get_sequence_nr", lambda: -1)()
+
+
+def _begin_again() -> None:
+    """Count what a forked process does alone."""
+    global _begun
+    _begun = _nodes()
+    reset_counts()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_again)
+
+
+def at_end(function: Callable[[], None]) -> Callable[[], None]:
+    """Have a function called once as the process ends; atexit does not in one that multiprocessing has forked."""
+
+    def once() -> None:
+        atexit.unregister(once)
+        function()
+
+    atexit.register(once)
+    util.register_after_fork(once, lambda once: util.Finalize(None, once, exitpriority=0))
+    return function
+
+
+@at_end
 def _say_last() -> None:
     """Print, as a process ends that took gradients, how many of its steps were weighted; on rank 0."""
     if not (_took_gradients() and is_first_process()):

@@ -23,9 +23,7 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
     """
     wanted = str(name).lower()
     known = {one.lower(): one for one in names}
-    near = difflib.get_close_matches(wanted, [one for one in known if one != wanted], 1, 0.6)
-    if wanted in known:  # in another case
-        near = [wanted]
+    near = difflib.get_close_matches(wanted, known, 1, 0.6)
     return f"; did you mean {known[near[0]]!r}?" if near else ""
 
 

@@ -7,10 +7,12 @@ from typing import NamedTuple, Optional, Sequence, Tuple
 import torch
 from torch import Tensor
 
+from legs_loss.autograd import is_compiling, is_transformed
 from legs_loss.errors import LegsError
 
 # A rendering may overshoot 1 and an HDR photograph may exceed it; 8-bit values are far larger.
 _SURELY_NOT_UNIT_RANGE = 16.0
+_LARGEST_WEIGHT = 1e6  # float32 overflows in the sum over an image of larger ones
 _CHANNELS = (1, 3, 4)  # of a photograph: gray, colour, colour and alpha; a rendering may have any number
 
 
@@ -55,7 +57,8 @@ class Layout(NamedTuple):
             name: "weight" or "mask", for the message.
 
         Raises:
-            LegsError: the shapes do not fit (the message names both), or the devices differ.
+            LegsError: the shapes do not fit (the message names both), or the devices differ; a mask of whole numbers;
+                on the CPU values that are NaN or negative, above 1 in a mask, above 1e6 in a weight.
         """
         if values is None:
             return None
@@ -63,6 +66,13 @@ class Layout(NamedTuple):
             raise LegsError(f"{name} must be a torch.Tensor, got {type(values).__name__}")
         if values.device != image.device:
             raise LegsError(f"{name} is on {values.device} and the images on {image.device}")
+        if name == "mask" and values.dtype is not torch.bool and not values.is_floating_point():
+            raise LegsError(f"mask is of type {values.dtype}: give bool, or floats in [0, 1] (8-bit: mask / 255.0)")
+        if values.device.type == "cpu" and not (is_compiling() or is_transformed()):
+            low, high = values.min().item(), values.max().item()
+            most = 1.0 if name == "mask" else _LARGEST_WEIGHT
+            if not (low >= 0.0 and high <= most):
+                raise LegsError(f"{name} has values from {low:g} to {high:g}: give values in [0, {most:g}]")
         batch = list(self.shape[:-3])
         height, width = self.shape[-3:-1] if self.channels_last else self.shape[-2:]
         one, none = ([height, width, 1] if self.channels_last else [1, height, width]), [height, width]
@@ -160,9 +170,8 @@ def check_values(image: Tensor, name: str = "target") -> None:
     """
     largest = float(image.detach().abs().amax())
     if largest != largest or largest == float("inf"):
-        bad = int((~torch.isfinite(image)).sum())
         raise LegsError(
-            f"{name} {shape_of(image)} has {bad} value(s) that are NaN or infinite: "
+            f"{name} {shape_of(image)} has values that are NaN or infinite: "
             "a weight map cannot be made from it; look at how this view is loaded"
         )
     if largest > _SURELY_NOT_UNIT_RANGE:

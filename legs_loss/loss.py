@@ -116,7 +116,7 @@ def legs_loss(
     spec = PRESETS[spec] if spec.__class__ is str and spec in PRESETS else as_spec(spec)
     if not 0.0 <= lambda_dssim <= 1.0:
         raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
-    made_by = None if weight is not None or spec.beta == 0.0 else spec
+    made_by = None if weight is not None or spec.beta == 0.0 or lambda_dssim == 1.0 else spec
     if made_by is not None and made_by.over == "scene":
         raise LegsError(NEEDS_LEVELS.format(where="one call does not know", then="and give LEGSLoss that store="))
     plan, image, photograph = plan_of(whole(lambda_dssim, padding), made_by, prediction, target, channels_last)

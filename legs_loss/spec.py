@@ -64,12 +64,11 @@ class WeightSpec:
     def __post_init__(self) -> None:
         check_operator(self.operator, self.p)
         curve(self.curve)
-        _check_number("beta", self.beta, 0.0 <= self.beta <= _LARGEST_FACTOR, "at least 0 and at most 1e6")
+        for name in ("beta", "noise_floor"):
+            factor = getattr(self, name)
+            _check_number(name, factor, 0.0 <= factor <= _LARGEST_FACTOR, "at least 0 and at most 1e6")
         _check_number("percentile", self.percentile, 0.0 < self.percentile <= 100.0, "above 0 and at most 100")
         _check_number("eps", self.eps, _LEAST_EPS <= self.eps < float("inf"), f"at least {_LEAST_EPS:g}")
-        _check_number(
-            "noise_floor", self.noise_floor, 0.0 <= self.noise_floor <= _LARGEST_FACTOR, "at least 0 and at most 1e6"
-        )
         _check_number("smooth", self.smooth, 0.0 <= self.smooth <= 100.0, "in [0, 100]")
         if self.normalise not in ("none", "mean"):
             raise LegsError(f'normalise must be "none" or "mean", got {self.normalise!r}')

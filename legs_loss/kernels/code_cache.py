@@ -98,11 +98,11 @@ def _stamp(module: str) -> str:
 
     These are its own, those of the modules that it imports names from, in its package or folder, and of theirs in turn.
     """
-    texts, names = {}, [module]
+    texts, names, package = {}, [module], module.split(".")[0] + "."
     folder = Path(sys.modules[module].__file__ or "").parent
     for name in names:
         path = Path(getattr(sys.modules.get(name), "__file__", None) or "")
-        if path.suffix == ".py" and name not in texts and (_top(name) == _top(module) or path.parent == folder):
+        if path.suffix == ".py" and name not in texts and (name.startswith(package) or path.parent == folder):
             texts[name] = path.read_bytes()
             names += (found.decode() for found in re.findall(rb"(?m)^from ([\w.]+) import", texts[name]))
     return _digest(b"\0".join([numba.__version__.encode(), *(texts[name] for name in sorted(texts))]))
@@ -110,10 +110,6 @@ def _stamp(module: str) -> str:
 
 def _fields(kind: Any) -> Any:
     return getattr(kind, "fields", ()), [*map(_fields, getattr(kind, "types", ()))]
-
-
-def _top(name: str) -> str:
-    return name.split(".")[0]
 
 
 def _digest(data: bytes) -> str:

@@ -112,7 +112,8 @@ class Backend:
         """Return whether the weights of a spec need no map: it differs from the defaults in what is known here only."""
         from legs_loss.kernels.codes import STENCILS
 
-        return spec.operator in STENCILS and spec.curve in self.curves and _is_known(spec)
+        known = WeightSpec(operator=spec.operator, p=spec.p, curve=spec.curve, beta=spec.beta, eps=spec.eps)
+        return spec.operator in STENCILS and spec.curve in self.curves and spec == known
 
     def prepare(
         self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, target: Tensor, wanted: bool
@@ -191,8 +192,3 @@ class _Once(torch.autograd.Function):
 # (prediction, target, map, range, prepared) -> the loss. Function.apply itself, which looks for torch.func first:
 # no transform is around where a backend is asked.
 node: Any = super(torch.autograd.Function, _FusedLoss).apply
-
-
-@lru_cache(maxsize=64)
-def _is_known(spec: WeightSpec) -> bool:
-    return spec == WeightSpec(operator=spec.operator, p=spec.p, curve=spec.curve, beta=spec.beta, eps=spec.eps)

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legs_loss.errors import LegsError
 from legs_loss.images import check_values
 from legs_loss.kernels.codes import CURVES
 from legs_loss.kernels.compiling import claimed, compiled, in_threads, part, said
@@ -30,7 +29,7 @@ class _NumbaBackend(Backend):
 
     def preparing(self) -> ContextManager[Any]:
         # In somebody's training script: where nobody looks, nothing is said.
-        return said("legs-loss", "5 to 15 s") if sys.stderr.isatty() else nullcontext()
+        return said("legs-loss", "5 to 15 s") if sys.stderr and sys.stderr.isatty() else nullcontext()
 
     def prepare(
         self, terms: Terms, spec: Optional[WeightSpec], prediction: Tensor, target: Tensor, wanted: bool
@@ -49,7 +48,6 @@ class _NumbaLoss(PreparedLoss):
         self.terms, self.spec, self.size = terms, spec, prediction.numel()
         self.shape, self.sizes = tuple(prediction.shape), (*(views or [1]), channels, height, width)
         self.wanted = self.size if wanted else 0
-        self.pixels = (height * width, self.size // channels)  # of a map: for all views, or for each
         self.eps = np.float32(0.0 if spec is None else spec.eps)
         made = WeightSpec() if spec is None else spec
         curve, beta = 0 if spec is None else CURVES[spec.curve], np.float32(made.beta)
@@ -68,8 +66,6 @@ class _NumbaLoss(PreparedLoss):
             found[:, 1] = 1 / (found[:, 1] + self.eps)
             source = source._replace(ranges=found)
         if map_ is not None:
-            if map_.numel() not in self.pixels:
-                raise LegsError(f"weight {list(map_.shape)} does not fit images {list(self.shape)}")
             source = source._replace(map=_flat(map_))
         gradient = np.empty(self.wanted, np.float32)
         if self.terms.ssim == 0.0:

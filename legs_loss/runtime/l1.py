@@ -107,7 +107,7 @@ def l1_loss(
 
 def _compiled_weights(prediction: Tensor, target: Tensor) -> Weights:
     """Return the weights for torch.compile: without a memo, they are part of the graph."""
-    spec = None if thread.unweighted or not is_trained(prediction) else spec_to_compile(state.generation)
+    spec = None if thread.unweighted else spec_to_compile(state.generation, is_trained(prediction))
     if spec is None and not thread.unweighted:
         check_order(prediction, target)
     if spec is not None and spec.over == "scene":
@@ -133,10 +133,10 @@ def _by_torch(
         if own is not None:
             return own(prediction, target)
         if mean and mask is None:
-            error = torch.abs(prediction - target)
-            if not error.is_floating_point():
-                raise LegsError(f"both images are of type {error.dtype}: give floats in [0, 1] (8-bit: image / 255.0)")
-            return error.mean()
+            types = prediction.dtype, target.dtype
+            if not torch.promote_types(*types).is_floating_point or torch.bool in types:
+                raise LegsError(f"the images are of types {types}: give floats in [0, 1] (8-bit images: image / 255.0)")
+            return torch.abs(prediction - target).mean()
     layout, prediction, target = read_pair(prediction, target, channels_last)
     weights = weights.with_map(target).masked(layout.map_first(mask, target, "mask"), renormalise=False)
     if mean:

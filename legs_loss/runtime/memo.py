@@ -54,9 +54,6 @@ class WeightMemo:
         self._entries: OrderedDict[Hashable, _Kept] = OrderedDict()
         self._lock = threading.RLock()
 
-    def __len__(self) -> int:
-        return len(self._entries)
-
     def recall(self, target: Tensor, make: Callable[[], Value], form: Hashable = None) -> Value:
         """Return the value of this target; or make it, and store it if the target can be identified later.
 
@@ -65,7 +62,7 @@ class WeightMemo:
             make: makes its weight map; or what takes little memory, as the range of its response.
             form: the kind of value, if there are several; each is stored separately.
         """
-        found = _key(target)
+        found, owner = _key(target)
         if found is None:
             return make()
         key = found, form
@@ -80,15 +77,14 @@ class WeightMemo:
         with self._lock:
             self._drop(key)
             if self._make_room(size):
-                self._entries[key] = _Kept(value, size, self._owner(target, key))
+                self._entries[key] = _Kept(value, size, self._alive(owner, key))
                 self.bytes += size
         return value
 
-    def _owner(self, target: Tensor, key: Hashable) -> Optional[weakref.ref[Tensor]]:
-        return None if target.device.type == "cpu" else self._owner_of_memory(target, key)
-
-    def _owner_of_memory(self, target: Tensor, key: Hashable) -> weakref.ref[Tensor]:
-        # A key that is an address is dropped with its tensor: the allocator reuses addresses.
+    def _alive(self, owner: Optional[Tensor], key: Hashable) -> Optional[weakref.ref[Tensor]]:
+        """Return what drops a key that is an address with the owner of that memory: the allocator reuses addresses."""
+        if owner is None:
+            return None
         memo = weakref.ref(self)
 
         def forget(_: object) -> None:
@@ -97,7 +93,7 @@ class WeightMemo:
                 with alive._lock:
                     alive._drop(key)
 
-        return weakref.ref(_storage_owner(target), forget)
+        return weakref.ref(owner, forget)
 
     def _drop(self, key: Hashable) -> None:
         entry = self._entries.pop(key, None)
@@ -143,24 +139,29 @@ class _Kept:
         return self.kept if self.form is None else torch.frombuffer(self.kept, dtype=self.form[0]).reshape(self.form[1])
 
 
-def _key(target: Tensor) -> Optional[Hashable]:
+# Of a target, if it can be known again; and the tensor with whose end that ends, if it does.
+_Key = Tuple[Optional[Hashable], Optional[Tensor]]
+
+
+def _key(target: Tensor) -> _Key:
     return _content_key(target) if target.device.type == "cpu" else _identity_key(target)
 
 
-def _content_key(target: Tensor) -> Hashable:
+def _content_key(target: Tensor) -> _Key:
     values = target.detach().resolve_neg().contiguous()
     digest = hashlib.sha256(values.reshape(-1).view(torch.uint8).numpy().data).digest()
-    return digest, tuple(target.shape), target.dtype
+    return (digest, tuple(target.shape), target.dtype), None
 
 
-def _identity_key(target: Tensor) -> Optional[Hashable]:
+def _identity_key(target: Tensor) -> _Key:
     try:
         version = target._version
     except RuntimeError:  # an inference tensor counts no writes
-        return None
-    base = target._base
-    return (
-        id(target if base is None else base),
+        return None, None
+    # `camera.original_image[:3]` is a new tensor every step; its base tensor is not.
+    owner = target if target._base is None else target._base
+    key = (
+        id(owner),
         target.data_ptr(),
         version,
         target.shape,
@@ -168,6 +169,7 @@ def _identity_key(target: Tensor) -> Optional[Hashable]:
         target.dtype,
         _current_stream(target.device),
     )
+    return key, owner
 
 
 _raw_stream: Any = getattr(torch._C, "_cuda_getCurrentRawStream", None)  # some microseconds faster
@@ -177,8 +179,3 @@ def _current_stream(device: torch.device) -> Optional[int]:
     if device.type != "cuda":
         return None
     return int(_raw_stream(device.index) if _raw_stream else torch.cuda.current_stream(device).cuda_stream)
-
-
-def _storage_owner(target: Tensor) -> Tensor:
-    # `camera.original_image[:3]` is a new tensor every step; its base tensor is not.
-    return target if target._base is None else target._base

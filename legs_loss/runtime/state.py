@@ -8,7 +8,6 @@ torch needs the map.
 
 from __future__ import annotations
 
-import atexit
 import os
 import sys
 import threading
@@ -21,9 +20,9 @@ from typing import Any, Deque, Dict, List, Optional, Sequence, Set, Union
 import torch
 from torch import Tensor
 
-from legs_loss.autograd import is_transformed
+from legs_loss.autograd import is_differentiated, is_in_a_node, is_transformed
 from legs_loss.config import Config, find_config
-from legs_loss.counting import Counts, counted, note_graph, reset_counts, say_first
+from legs_loss.counting import Counts, at_end, counted, note_graph, reset_counts, say_first
 from legs_loss.errors import LegsError
 from legs_loss.images import shape_of
 from legs_loss.kernels.available import is_capturing
@@ -59,9 +58,8 @@ class TrainingRun:
 
     def __init__(self, config: Config, memo_bytes: int = DEFAULT_LIMIT) -> None:
         self.config = config
-        self.weighted: bool = config.active
-        self._asks = config.store is not None or config.require_masks
-        self.computes: bool = not self._asks
+        self.weighted: bool = not (config.off or config.spec.unweighted)
+        self.computes: bool = config.store is None and not config.require_masks
         self.said: bool = False
         self.memo: WeightMemo = WeightMemo(memo_bytes)
         self.stored: Stored = Stored(config, self.say_once)
@@ -94,7 +92,7 @@ class TrainingRun:
         if made and self.computes and target.device.type == "cpu":
             counted.computed += count
             return Weights(self.config.spec)
-        if view is None and target.dim() == 3 and self.weighted and not (self._asks and self.has_users_maps()):
+        if view is None and target.dim() == 3 and self.weighted and (self.computes or not self.has_users_maps()):
             found = self._weight(target, None, made)
             return found if isinstance(found, Weights) else Weights(map=found)
         images = [target] if target.dim() == 3 else list(target)
@@ -227,7 +225,7 @@ def _run_of(number: int) -> TrainingRun:
         return _runs[number]
 
 
-@atexit.register
+@at_end
 def _say_masked() -> None:
     """Print, as the process ends, what the masks of its last run were used for."""
     if _masked:
@@ -246,10 +244,22 @@ def refuse_masks(number: int) -> None:
         raise LegsError(_NOT_IN_A_GRAPH)
 
 
-def spec_to_compile(number: int) -> Optional[WeightSpec]:
-    """Return the spec of a compiled call, None without a weight; arguments and errors as :func:`refuse_masks`."""
-    refuse_masks(number)
+def spec_to_compile(number: int, is_trained: bool) -> Optional[WeightSpec]:
+    """Return the spec of a compiled call, None without a weight.
+
+    Args:
+        number: as for :func:`refuse_masks`, whose errors it raises, too.
+        is_trained: whether the prediction requires a gradient. What else may take one is an error.
+    """
     run = _run_of(number)
+    if not is_trained:
+        if run.active and (is_differentiated() or is_in_a_node()):
+            raise LegsError(
+                "torch.func, forward-mode AD or a re-entrant checkpoint with torch.compile: the graph does not show "
+                "whether l1_loss is trained, so weighted. Leave one of them out, or call legs_loss, which always is"
+            )
+        return None
+    refuse_masks(number)
     run.say_what_is_used()
     if run.weighted:
         note_graph()

@@ -43,15 +43,11 @@ class WeightStore:
     def __init__(self, path: Union[str, Path]) -> None:
         self.path: Path = Path(path)
         self.entries: Dict[Tuple[Any, ...], Entry] = {entry.key: entry for entry in read_manifest(self.path)}
-        self._by_name: Dict[Tuple[Any, ...], Optional[Entry]] = {}
         self._by_image: Dict[Tuple[Any, ...], List[Entry]] = {}
         self._levels: Dict[Tuple[WeightSpec, int], Optional[Tensor]] = {}
         for entry in self.entries.values():
             for name in (entry.fingerprint, entry.sample):
                 self._by_image.setdefault((name, entry.height, entry.width), []).append(entry)
-            for name in view_names(entry.view):
-                key = (name, *entry.key[1:])
-                self._by_name[key] = None if key in self._by_name else entry
 
     def find(self, view: str, height: int, width: int, spec: WeightSpec) -> Optional[Entry]:
         """Return the entry of a view at a size for a spec's operator, or None.
@@ -64,8 +60,9 @@ class WeightStore:
             spec: what its response is made with counts; for one that is normalised over the scene, the entry must
                 have what that needs.
         """
-        entry = self._by_name.get((view.replace("\\", "/"), height, width, *_made_with(spec)))
-        return entry if entry is not None and self.fits(entry, spec) else None
+        wanted, key = view.replace("\\", "/"), (height, width, *_made_with(spec))
+        named = [entry for entry in self.entries.values() if entry.key[1:] == key and wanted in view_names(entry.view)]
+        return named[0] if len(named) == 1 and self.fits(named[0], spec) else None
 
     def find_image(self, image: Tensor, spec: WeightSpec) -> Optional[Found]:
         """Return what the store has of an image [C, H, W], whatever its view is called; None if that was never read.

@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable, Dict, Iterable
+import sys
+from typing import Any, Callable, Dict
 
 
 def plugins(group: str) -> Dict[str, Callable[[], Any]]:
@@ -15,18 +16,13 @@ def plugins(group: str) -> Dict[str, Callable[[], Any]]:
     >>> sorted(plugins("no.such.group"))
     []
     """
-    return {point.name: point.load for point in _entry_points(group)}
+    if sys.version_info < (3, 8):
+        import pkg_resources
 
-
-def _entry_points(group: str) -> Iterable[Any]:
-    try:
+        points: Any = pkg_resources.iter_entry_points(group)
+    else:
         from importlib import metadata
-    except ImportError:  # Python 3.7
-        try:
-            import importlib_metadata as metadata  # type: ignore[no-redef]
-        except ImportError:
-            import pkg_resources
 
-            return pkg_resources.iter_entry_points(group)
-    found: Any = metadata.entry_points()
-    return found.select(group=group) if hasattr(found, "select") else found.get(group, ())  # a dict before 3.10
+        found: Any = metadata.entry_points()
+        points = found.select(group=group) if hasattr(found, "select") else found.get(group, ())  # a dict before 3.10
+    return {point.name: point.load for point in points}

@@ -36,7 +36,10 @@ def progress(total: int, what: str) -> Any:
     from tqdm import tqdm
 
     shown = "{n:.0f} of {total} " + what + ", {elapsed}"
-    return tqdm(total=total, bar_format=shown, delay=2, leave=False, disable=not sys.stderr.isatty())
+    return tqdm(total=total, bar_format=shown, delay=2, leave=False, disable=not (sys.stderr and sys.stderr.isatty()))
+
+
+_was_first = True  # by the process group, which a script may have left when its process ends
 
 
 def is_first_process() -> bool:
@@ -48,7 +51,9 @@ def is_first_process() -> bool:
     >>> is_first_process()
     True
     """
+    global _was_first
     distributed = sys.modules.get("torch.distributed")
     if distributed is not None and distributed.is_available() and distributed.is_initialized():
-        return bool(distributed.get_rank() == 0)
-    return os.environ.get("RANK", "0") in ("", "0")
+        _was_first = distributed.get_rank() == 0
+        return _was_first
+    return _was_first and os.environ.get("RANK", "0") in ("", "0")

@@ -9,6 +9,8 @@ import sys
 
 import pytest
 import torch
+from torch.autograd import forward_ad
+from torch.utils.checkpoint import checkpoint
 
 from legs_loss import LEGSLoss, WeightSpec, l1_loss, legs_loss, ssim, weight_map, weighted_l1
 from legs_loss.runtime import state
@@ -79,6 +81,54 @@ def test_portrait_and_landscape_in_one_capture(loss, axes, dynamic):
         found = value_and_gradient(compiled, prediction, target)
         for mine, eager in zip(found, value_and_gradient(loss, prediction, target)):
             torch.testing.assert_close(mine, eager, rtol=1e-4, atol=1e-6)
+
+
+TRANSFORMS = {
+    "grad": lambda a, b: torch.func.grad(l1_loss)(a, b),
+    "vmap": lambda a, b: torch.func.vmap(l1_loss)(a[None], b[None]),
+    "jvp": lambda a, b: torch.func.jvp(lambda one: l1_loss(one, b), (a,), (a,)),
+    "forward AD": lambda a, b: _dual(l1_loss, a, b),
+}
+
+
+def _dual(loss, image, target):
+    with forward_ad.dual_level():
+        return forward_ad.unpack_dual(loss(forward_ad.make_dual(image, image), target)).primal
+
+
+@pytest.mark.skipif(not hasattr(torch, "func"), reason="this torch has no torch.func")
+class TestWithATransform:
+    """A graph does not show whether `l1_loss` is trained: one error, never the plain mean in silence."""
+
+    @pytest.mark.parametrize("name", TRANSFORMS)
+    def test_within_a_graph(self, name):
+        image, target = torch.rand(3, 9, 8), torch.rand(3, 9, 8)
+        with pytest.raises(Exception, match=r"with torch\.compile: the graph does not show"):
+            torch.compile(TRANSFORMS[name], backend="eager")(image, target)
+
+    def test_around_a_graph(self):
+        image, target = torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8)
+        compiled = torch.compile(l1_loss, backend="eager")
+        for around in (
+            lambda: torch.func.vmap(compiled)(image[None], target[None]),
+            lambda: checkpoint(compiled, image, target, use_reentrant=True),
+            lambda: _dual(compiled, image.detach(), target),
+        ):
+            torch._dynamo.reset()
+            with pytest.raises(Exception, match=r"with torch\.compile: the graph does not show"):
+                around()
+
+    def test_what_is_always_weighted_is_computed(self):
+        image, target = torch.rand(3, 16, 20), torch.rand(3, 16, 20)
+        compiled = torch.compile(lambda a, b: torch.func.grad(legs_loss)(a, b), backend="eager")
+        expected = value_and_gradient(legs_loss, image.clone().requires_grad_(), target)[1]
+        torch.testing.assert_close(compiled(image, target), expected, rtol=1e-4, atol=1e-7)
+
+    def test_what_is_off_is_plain(self, monkeypatch):
+        monkeypatch.setenv("LEGS_OFF", "1")
+        image, target = torch.rand(3, 9, 8), torch.rand(3, 9, 8)
+        compiled = torch.compile(TRANSFORMS["grad"], backend="eager")
+        torch.testing.assert_close(compiled(image, target), (image - target).sign() / image.numel())
 
 
 SCRIPT = """

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from legs_loss import LegsError, LEGSLoss, WeightSpec, d_ssim, l1_loss, legs_loss, weight_map, weighted_l1
+from legs_loss import LegsError, LEGSLoss, WeightSpec, d_ssim, l1_loss, legs_loss, ssim, weight_map, weighted_l1
 from tests.loss.test_ssim import formula_of_3dgs
 from tests.strategies import images
 
@@ -116,6 +118,23 @@ class TestMask:
         empty = torch.zeros(1, 6, 6)
         assert float(weighted_l1(prediction, target, mask=empty)) == 0.0
         assert float(weighted_l1(prediction, target, mask=empty, renormalise=True)) == 0.0
+
+    @pytest.mark.parametrize("function", [l1_loss, legs_loss, weighted_l1, LEGSLoss(), ssim], ids=str)
+    def test_a_mask_in_other_units_is_refused(self, function):
+        prediction, target = torch.rand(3, 16, 16, requires_grad=True), torch.rand(3, 16, 16)
+        white = torch.full((16, 16), 255, dtype=torch.uint8)
+        with pytest.raises(LegsError, match=r"mask is of type torch.uint8: give bool, or floats in \[0, 1\]"):
+            function(prediction, target, mask=white)
+        for value, says in ((255.0, "from 255 to 255"), (-1.0, "from -1 to -1"), (math.nan, "from nan to nan")):
+            with pytest.raises(LegsError, match=rf"mask has values {says}: give values in \[0, 1\]"):
+                function(prediction, target, mask=torch.full((16, 16), value))
+
+    @pytest.mark.parametrize("value", [-1.0, math.nan, math.inf, 2e6])
+    def test_a_weight_that_is_none_is_refused(self, value):
+        prediction, target = torch.rand(3, 16, 16, requires_grad=True), torch.rand(3, 16, 16)
+        for function in (legs_loss, weighted_l1, LEGSLoss()):
+            with pytest.raises(LegsError, match=r"weight has values from .*: give values in \[0, 1e\+06\]"):
+                function(prediction, target, weight=torch.full((16, 16), value))
 
 
 class TestLayouts:

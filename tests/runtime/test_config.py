@@ -16,7 +16,7 @@ def find(start=None, argv=(), **environ):
 
 def test_the_defaults_are_the_preset_legs():
     config = find()
-    assert (config.spec, config.preset, config.store, config.active) == (PRESETS["legs"], "legs", None, True)
+    assert (config.spec, config.preset, config.store, config.off) == (PRESETS["legs"], "legs", None, False)
 
 
 def test_a_file_above_the_script_is_found_up_to_the_checkouts_root(tmp_path):
@@ -65,9 +65,7 @@ def test_the_environment_wins_over_the_file(tmp_path):
     ],
 )
 def test_legs_off(value, off):
-    config = find(LEGS_OFF=value)
-    assert config.off is off
-    assert config.active is not off
+    assert find(LEGS_OFF=value).off is off
 
 
 @pytest.mark.parametrize("value", ["2", "of", "disabled", "-1"])
@@ -76,8 +74,8 @@ def test_legs_off_that_is_neither_yes_nor_no(value):
         find(LEGS_OFF=value)
 
 
-def test_beta_zero_is_not_active():
-    assert not find(LEGS_BETA="0").active
+def test_beta_zero_is_unweighted():
+    assert find(LEGS_BETA="0").spec.unweighted
 
 
 @pytest.mark.parametrize("form", [["-s", "{}"], ["--source_path", "{}"], ["--source_path={}"], ["-s={}"]])
@@ -99,6 +97,7 @@ def test_the_store_of_the_scripts_scene_is_found(tmp_path, form):
             'prest = "legs"',
             "legs.toml: unknown setting 'prest'; there are preset, store, operator.*; did you mean 'preset'",
         ),
+        ("lambda = 0.2", "unknown setting 'lambda'.*: the share of D-SSIM is the codebase's own setting"),
         ("beta = ", "legs.toml cannot be read"),
     ],
 )
@@ -130,6 +129,10 @@ def test_an_unknown_variable_is_told_and_has_no_effect():
     assert config.notes == (
         "environment variable LEGS_BETAA is not known and has no effect; did you mean 'LEGS_BETA'?",
     )
+
+
+def test_what_is_near_by_its_beginning_alone_is_not_proposed():
+    assert find(LEGS_SEED="3").notes == ("environment variable LEGS_SEED is not known and has no effect",)
 
 
 def test_the_search_outside_git_ends_at_the_home_folder(tmp_path, monkeypatch):

@@ -151,7 +151,6 @@ class TestMemo:
     def test_any_order_of_changing_targets_gets_its_own_weight(self, monkeypatch, by):
         if by == "identity":
             monkeypatch.setattr(memo, "_key", memo._identity_key)
-            monkeypatch.setattr(memo.WeightMemo, "_owner", memo.WeightMemo._owner_of_memory)
         generator = torch.Generator().manual_seed(5)
         stored = [torch.rand(4, 6, 7) for _ in range(3)]
         prediction = torch.rand(3, 6, 7, requires_grad=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 import pytest
@@ -51,6 +52,7 @@ class TestSwapped:
         torch.testing.assert_close(ssim(target, image), ssim(image, target))
         torch.testing.assert_close(legs_loss(target, image, "3dgs"), legs_loss(image, target, "3dgs"))
         torch.testing.assert_close(legs_loss(target, image, weight=weight), legs_loss(image, target, weight=weight))
+        torch.testing.assert_close(legs_loss(target, image, lambda_dssim=1.0), 1.0 - ssim(image, target))
         assert torch.equal(unweighted(l1_loss)(target, image), plain(target, image))
         configure("3dgs")
         assert torch.equal(l1_loss(target, image), plain(target, image))
@@ -74,6 +76,27 @@ from legs_loss import l1_loss
 model, target = torch.nn.Linear(4, 4), torch.rand(3, 8, 4)
 with torch.no_grad():
     l1_loss(model(target), target)
+"""
+FORKED = """
+import multiprocessing, os, sys, torch
+from legs_loss import l1_loss
+Process = multiprocessing.get_context("fork").Process
+def train(steps):
+    image, target = torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8)
+    optimizer = torch.optim.SGD([image], 0.1)
+    for step in range(steps):
+        l1_loss(image, target).backward()
+        optimizer.step()
+train(2)
+child = ({child}){start}
+for process in multiprocessing.active_children():
+    process.join()
+{wait}
+"""
+GROUP = """
+import torch, torch.distributed
+torch.distributed.is_available = torch.distributed.is_initialized = lambda: True
+torch.distributed.get_rank = lambda: 1
 """
 ACTIVE = "L1 weighted, preset legs: laplacian, C3, beta 10; weights computed from the training images; settings from "
 BETA = ", beta 0; settings from environment variable "
@@ -142,6 +165,26 @@ class TestALineAtEachEnd:
         weighted = code.replace("(image - target).abs().mean()\n", "legs_loss.l1_loss(image, target)\n", 1)
         assert said(weighted, tmp_path) == [f"legs-loss: {ACTIVE}defaults", last]
 
+    @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+    @pytest.mark.parametrize(
+        ("child", "theirs"),
+        [
+            ("Process(target=train, args=(3,))", ["3"]),  # multiprocessing runs no atexit in it
+            ("Process(target=str)", []),  # as a worker of a DataLoader
+            ("os.fork() or (train(3), sys.exit())", ["3"]),
+            ("os.fork() or sys.exit()", []),
+        ],
+    )
+    def test_a_forked_process_counts_its_own_steps(self, tmp_path, child, theirs):
+        start, wait = ("", "os.wait()") if "os.fork" in child else (".start()", "")
+        code = FORKED.format(child=child, start=start, wait=wait)
+        lines = [line for line in said(code, tmp_path) if "settings from" not in line]
+        assert lines == [f"legs-loss: {n} step(s) weighted, 0 plain with a gradient" for n in (*theirs, "2")]
+
+    def test_a_rank_that_has_left_its_group_says_nothing(self, tmp_path):
+        code = TRAIN.format(loss="legs_loss.l1_loss(image, target)").replace("import torch\n", GROUP, 1)
+        assert said(code + "torch.distributed.is_initialized = lambda: False\n", tmp_path) == []
+
     def test_of_a_training_that_calls_none_and_of_an_evaluation(self, tmp_path):
         code = TRAIN.format(loss="(image - target).abs().mean()")
         assert said(code, tmp_path) == ["legs-loss: no L1 was weighted in this run"]
@@ -149,10 +192,14 @@ class TestALineAtEachEnd:
 
 
 class TestNamed:
-    def test_integers_on_both_sides(self):
-        image = torch.zeros(3, 8, 8, dtype=torch.uint8)
-        with pytest.raises(LegsError, match="both images are of type"):
+    @pytest.mark.parametrize("kind", [torch.uint8, torch.int64, torch.bool, torch.complex64])
+    def test_types_that_are_no_floats(self, kind):
+        image = torch.zeros(3, 8, 8, dtype=kind)
+        with pytest.raises(LegsError, match=f"the images are of types .*{kind}.*: give floats"):
             l1_loss(image, image)
+        if kind in (torch.bool, torch.complex64):
+            with pytest.raises(LegsError, match="the images are of types"):
+                l1_loss(image, torch.zeros(3, 8, 8))
 
     def test_a_variable_for_lambda_names_lambda_s_own_setting(self):
         (note,) = find_config(environ={"LEGS_LAMBDA": "0.3"}, argv=[]).notes

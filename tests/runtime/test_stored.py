@@ -164,7 +164,7 @@ class TestCapture:
             torch.testing.assert_close(l1_loss(prediction, target, view="a"), weighted(prediction, target))
             target.copy_(torch.rand(3, 9, 8))  # as a replay would find it
         assert (counts().computed, counts().stored, counts().remembered) == (2, 0, 0)
-        assert len(run.memo) == 0
+        assert len(run.memo._entries) == 0
 
     def test_only_a_cuda_device_is_asked(self, monkeypatch):
         monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)

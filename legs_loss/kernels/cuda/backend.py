@@ -139,8 +139,6 @@ class _Launches(PreparedLoss):
             task.of_target = Strides(*_batch(y).stride())
         made = None  # it must live until the last launch, as the map; the allocator keeps the order of one stream
         if map_ is not None:
-            if map_.numel() not in self._pixels:
-                raise ValueError(f"weights {list(map_.shape)} do not fit images {list(self._shape)}")
             map_ = map_.detach().to(torch.float32).contiguous()
             task.map, task.map_view = map_.data_ptr(), map_.numel() > self._pixels[0]
         if self._ranging and (range_ is None or self._ssim):

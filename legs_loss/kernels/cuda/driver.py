@@ -48,16 +48,6 @@ class OutOfMemory(NotNow):
     """The card is full: torch computes this call, and the next one tries again."""
 
 
-def load_library() -> Any:
-    """Return the driver's library.
-
-    Raises:
-        OSError: there is none.
-    """
-    name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
-    return (ctypes.WinDLL if sys.platform == "win32" else ctypes.CDLL)(name)  # type: ignore[attr-defined]
-
-
 class CudaDriver:
     """One GPU.
 
@@ -72,7 +62,9 @@ class CudaDriver:
     """
 
     def __init__(self, device: torch.device, library: Optional[Any] = None, runtime: Any = torch.cuda) -> None:
-        library = load_library() if library is None else library
+        if library is None:
+            is_windows = sys.platform == "win32"
+            library = ctypes.WinDLL("nvcuda.dll") if is_windows else ctypes.CDLL("libcuda.so.1")  # type: ignore[attr-defined]
         for name, arguments in _ARGUMENTS.items():
             getattr(library, name).argtypes = arguments
         self._library, self._runtime, self._launch_kernel = library, runtime, library.cuLaunchKernel
@@ -82,10 +74,8 @@ class CudaDriver:
         properties = runtime.get_device_properties(index)
         self.architecture: int = 10 * properties.major + properties.minor
         self.multiprocessors: int = properties.multi_processor_count
-        context = ctypes.c_void_p()
         # torch numbers the devices that CUDA_VISIBLE_DEVICES leaves, and so does the driver.
-        self._call("cuDevicePrimaryCtxRetain", ctypes.byref(context), index)
-        self._context = context.value
+        self._context = self._made("cuDevicePrimaryCtxRetain", index)
         raw = getattr(torch._C, "_cuda_getCurrentRawStream", None)  # some microseconds faster
         usual = runtime is not torch.cuda or raw is None
         self._stream: Any = (lambda index: runtime.current_stream(index).cuda_stream) if usual else raw
@@ -97,23 +87,17 @@ class CudaDriver:
             OutOfMemory: there is no room for it.
             DriverError: it cannot be loaded.
         """
-        module = ctypes.c_void_p()
         with self._current():
             try:
-                self._call("cuModuleLoadData", ctypes.byref(module), binary)
+                return self._made("cuModuleLoadData", binary)
             except OutOfMemory:
                 self._runtime.empty_cache()
-                self._call("cuModuleLoadData", ctypes.byref(module), binary)
-        assert module.value is not None
-        return module.value
+                return self._made("cuModuleLoadData", binary)
 
     def function(self, module: int, name: str) -> int:
         """Return a kernel of a module."""
-        function = ctypes.c_void_p()
         with self._current():
-            self._call("cuModuleGetFunction", ctypes.byref(function), module, name.encode())
-        assert function.value is not None
-        return function.value
+            return self._made("cuModuleGetFunction", module, name.encode())
 
     def launch(self, task: ctypes.Structure, *kernels: Tuple[int, int, int]) -> None:
         """Launch kernels, each with its blocks and threads, in this order on torch's current stream.
@@ -152,6 +136,12 @@ class CudaDriver:
         finally:
             self._call("cuCtxSetCurrent", before)
             self._call("cuThreadExchangeStreamCaptureMode", ctypes.byref(mode))
+
+    def _made(self, name: str, *arguments: Any) -> Any:
+        """Return what a function of the driver writes to its first argument."""
+        made = ctypes.c_void_p()
+        self._call(name, ctypes.byref(made), *arguments)
+        return made.value
 
     def _call(self, name: str, *arguments: Any) -> None:
         code = getattr(self._library, name)(*arguments)

@@ -15,7 +15,7 @@ import signal
 import uuid
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Callable, Dict, Generator, Iterable, Iterator, Optional, Tuple
 
@@ -65,29 +65,28 @@ def _outcome(task: Work, argument: Any, tell: Listener) -> Any:
         return error
 
 
-class _Process:
-    """A process that runs tasks, one at a time, and this side's end of its pipe.
+def _started(task: Work) -> Tuple[Any, BaseProcess]:
+    """Start a process that runs tasks, one at a time; return this side's end of its pipe, and the process.
 
     One that dies costs one task, and when this process dies, it finds its pipe closed and ends.
     """
+    if not os.access(os.curdir, os.X_OK):  # the child is started in it, by its name
+        raise LegsError("the current folder is another user's, and processes cannot be started in it: leave it")
+    context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_work, args=(theirs, task), daemon=True)
+    with keep_ctrl_c_from_children():
+        process.start()
+    theirs.close()
+    return ours, process
 
-    def __init__(self, task: Work) -> None:
-        context = multiprocessing.get_context("spawn")  # forked, it would inherit locks and threads
-        ours, theirs = context.Pipe()
-        self.connection: Connection = ours
-        self.process: BaseProcess = context.Process(target=_work, args=(theirs, task), daemon=True)
-        if not os.access(os.curdir, os.X_OK):  # the child is started in it, by its name
-            raise LegsError("the current folder is another user's, and processes cannot be started in it: leave it")
-        with keep_ctrl_c_from_children():
-            self.process.start()
-        theirs.close()
 
-    def end(self, patience: float = 0.0) -> None:
-        """Close the pipe, which ends the process when it is idle; after some seconds kill it."""
-        self.connection.close()
-        self.process.join(patience)
-        self.process.terminate()
-        self.process.join()
+def _end(connection: Any, process: BaseProcess, patience: float = 0.0) -> None:
+    """Close the pipe, which ends the process when it is idle; after some seconds kill it."""
+    connection.close()
+    process.join(patience)
+    process.terminate()
+    process.join()
 
 
 @contextmanager
@@ -122,38 +121,36 @@ def _ensure_tracker() -> None:
 
 def _in_processes(task: Work, arguments: Iterable[Any], processes: int, listen: Listener) -> Outcomes:
     waiting = list(arguments)[::-1]
-    crew: Dict[Any, Tuple[_Process, Any]] = {}  # by this side's end of their pipes
+    crew: Dict[Any, Tuple[BaseProcess, Any]] = {}  # by this side's end of their pipes
 
-    def give(process: _Process) -> None:
-        argument = waiting.pop()
-        crew[process.connection] = process, argument
+    def give(connection: Any, process: BaseProcess) -> None:
+        crew[connection] = process, waiting.pop()
         with suppress(OSError):  # it died; its pipe will say so
-            process.connection.send(argument)
+            connection.send(crew[connection][1])
 
     try:
         for _ in range(min(processes, len(waiting))):
-            give(_Process(task))
+            give(*_started(task))
         while crew:
-            for connection in wait(list(crew)):
-                process, argument = crew[connection]
+            ready: Iterable[Any] = wait(list(crew))
+            for connection in ready:
+                is_alive = True
                 try:
-                    ended, message = process.connection.recv()
+                    ended, message = connection.recv()
                 except (EOFError, OSError):
-                    ended, message = True, LegsError("its process was killed (out of memory?)")
-                    process.end()
-                    process = _Process(task) if waiting else process
+                    is_alive, ended, message = False, True, LegsError("its process was killed (out of memory?)")
                 if not ended:
                     listen(message)
                     continue
-                del crew[connection]
+                process, argument = crew.pop(connection)
+                if not (is_alive and waiting):
+                    _end(connection, process, _PATIENCE_AT_END)
                 if waiting:
-                    give(process)
-                else:
-                    process.end(_PATIENCE_AT_END)
+                    give(*((connection, process) if is_alive else _started(task)))
                 yield argument, message
     finally:
-        for process, _ in crew.values():
-            process.end()
+        for connection, (process, _) in crew.items():
+            _end(connection, process)
 
 
 def _work(connection: Any, task: Work) -> None:

@@ -84,11 +84,11 @@ def stores_of(scenes: Sequence[Path], out: Optional[str]) -> List[Path]:
         return [scene / STORE_FOLDER for scene in scenes]
     if len(scenes) == 1:
         return [Path(out)]
-    names = Counter(scene.resolve().name for scene in scenes)
-    twice = [name for name, count in names.items() if count > 1]
-    if twice:
-        raise LegsError(f"--out {out}: {names[twice[0]]} scenes have the name {twice[0]}: leave out --out for them")
-    return [Path(out) / scene.resolve().name for scene in scenes]
+    names = [scene.resolve().name for scene in scenes]
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise LegsError(f"--out {out}: {count} scenes have the name {name}: leave out --out for them")
+    return [Path(out) / name for name in names]
 
 
 def precompute_scene(task: SceneTask, tell: Listener) -> Report:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Callable, Dict, Iterator, List, NamedTuple, Optional, Tuple
@@ -31,11 +32,7 @@ _LONGEST = 4096  # bytes of an image's name
 _FARTHEST_CAMERA = 1e12  # in the scene's unit: what float32 can still compute with
 
 
-class _Intrinsics(NamedTuple):
-    model: str
-    width: int
-    height: int
-    params: Tuple[float, ...]
+_Lens = Tuple[str, Optional[Camera]]  # the model's name; a pinhole as it stands in the origin
 
 
 class _Image(NamedTuple):
@@ -67,8 +64,9 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
         path = images / name
         if not os.path.isfile(str(path)) and os.path.isfile(str(images / path.name)):  # pathlib's raise for some names
             path, name = images / path.name, path.name
-        lens = cameras[image.camera_id]
-        views.append(View(f"{prefix}{name}", path, _pinhole(lens, image.pose), camera_model=lens.model))
+        model, pinhole = cameras[image.camera_id]
+        camera = None if pinhole is None else replace(pinhole, world_to_camera=image.pose)
+        views.append(View(f"{prefix}{name}", path, camera, camera_model=model))
     points = partial(_read, points_file) if points_file.is_file() else None
     return Scene(root, "colmap", tuple(views), points, notes=_larger_models(root, file.parent, len(views)))
 
@@ -113,13 +111,6 @@ def _read(path: Path) -> Any:
         raise LegsError(f"{path} is not as COLMAP writes it: {error}") from None
 
 
-def _pinhole(lens: _Intrinsics, pose: np.ndarray) -> Optional[Camera]:
-    if lens.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
-        return None
-    *focal, cx, cy = lens.params
-    return Camera(lens.width, lens.height, focal[0], focal[-1], cx, cy, pose)
-
-
 class _Cursor:
     """Reads a binary file from front to back; at its end all of it must be read."""
 
@@ -146,7 +137,7 @@ class _Cursor:
         self.file.seek(size, os.SEEK_CUR)
 
 
-def _cameras_bin(cursor: _Cursor) -> Dict[int, _Intrinsics]:
+def _cameras_bin(cursor: _Cursor) -> Dict[int, _Lens]:
     cameras = []
     for _ in range(cursor.take("Q")[0]):
         number, model, width, height = cursor.take("iiQQ")
@@ -193,7 +184,7 @@ def _rows(text: str, layout: str, read: Callable[[str, Lines], Any]) -> List[Any
     return rows
 
 
-def _cameras_txt(text: str) -> Dict[int, _Intrinsics]:
+def _cameras_txt(text: str) -> Dict[int, _Lens]:
     return dict(_rows(text, _CAMERA_LINE, lambda line, _: _camera(*line.split())))
 
 
@@ -225,14 +216,17 @@ def _points_txt(text: str) -> PointCloud:
     return _cloud(_rows(text, _POINT_LINE, lambda line, _: point(*line.split(None, 7))))
 
 
-def _camera(number: Any, model: str, width: Any, height: Any, *params: Any) -> Tuple[int, _Intrinsics]:
+def _camera(number: Any, model: str, width: Any, height: Any, *params: Any) -> Tuple[int, _Lens]:
     """Return a camera with its number, by the values of its line, or of its record."""
-    lens = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
+    width, height, params = int(width), int(height), tuple(map(float, params))
     if len(params) != MODELS.get(model, len(params)):
         raise ValueError(f"a camera of model {model} has {MODELS[model]} parameters, not {len(params)}")
-    if not is_lens(lens.width, lens.height, lens.params[: 2 if model == "PINHOLE" else 1], lens.params):
-        raise ValueError(f"a camera of {lens.width}x{lens.height} pixels with parameters {lens.params}")
-    return int(number), lens
+    if not is_lens(width, height, params[: 2 if model == "PINHOLE" else 1], params):
+        raise ValueError(f"a camera of {width}x{height} pixels with parameters {params}")
+    if model not in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return int(number), (model, None)
+    *focal, cx, cy = params
+    return int(number), (model, Camera(width, height, focal[0], focal[-1], cx, cy, np.eye(4)))
 
 
 def _image(_: Any, w: Any, x: Any, y: Any, z: Any, tx: Any, ty: Any, tz: Any, camera_id: Any, name: str) -> _Image:

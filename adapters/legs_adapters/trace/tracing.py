@@ -44,7 +44,7 @@ def trace(root: Path, text: str, steps: int, cpu: bool = False, photos: Optional
                 places = {"scene": write_embedded_scene(work / "scene", **SCENE), "output": work / "output"}
                 more = filled(root / script, None, command.arguments, 10 * steps, **places)
                 command = command._replace(arguments=[*command.arguments, *more])
-        say(f"legs-patch: running {script} in {root} for {steps} steps; it writes where it always does", sys.stderr)
+        say(f"legs-patch: {steps} steps of {script} as it is, in {root}; it writes where it always does", sys.stderr)
         seen = run_watched(root, work, command, steps, cpu, photos)
     if seen.code and not seen.is_over:  # (a rank that waits for one that has ended fails)
         message = f"{script} ended with exit code {seen.code}; nothing was changed. By reading: legs-patch {root}"

@@ -9,7 +9,6 @@ import libcst as cst
 
 from legs_adapters.code.module import Class, Function
 from legs_adapters.code.program import Program, Reference
-from legs_adapters.code.syntax import call_name
 
 _Call = Tuple[Function, cst.Call]  # with the function that it stands in
 
@@ -18,7 +17,7 @@ def _named(program: Program, function: Function, most: Optional[int] = None) -> 
     """Yield the calls of a function's name elsewhere."""
     for caller in islice(program.mentioning(function.name, True), most):
         if caller is not function and caller.module.spend(len(caller.flow.calls)):
-            yield from ((caller, call) for call in caller.flow.calls if call_name(call) == function.name)
+            yield from ((caller, call) for call in caller.flow.calls_of.get(function.name, ()))
 
 
 def _resolved(program: Program, caller: Function, node: cst.CSTNode) -> List[object]:

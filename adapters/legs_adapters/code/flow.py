@@ -39,7 +39,7 @@ class Flow:
 
     Attributes:
         definitions: every definition by place, in source order: what a nested function sees.
-        calls: every call in the body, in source order, nested functions excepted.
+        calls, calls_of: every call in the body, in source order, nested functions excepted; those of a name.
         expressions: every call and binary operation.
         reads: every name that is read, in source order.
         returns: the expressions that it returns or yields.
@@ -76,6 +76,9 @@ class Flow:
         for node in self._visited.values():
             by_class.setdefault(type(node), []).append(node)
         self.calls: List[cst.Call] = by_class.get(cst.Call, [])
+        self.calls_of: Dict[str, List[cst.Call]] = {}
+        for call in self.calls:
+            self.calls_of.setdefault(call_name(call), []).append(call)
         self.expressions: List[cst.CSTNode] = [*self.calls, *by_class.get(cst.BinaryOperation, ())]
         self.reads: List[cst.Name] = by_class.get(cst.Name, [])
         self.imports: List[cst.CSTNode] = [*by_class.get(cst.Import, ()), *by_class.get(cst.ImportFrom, ())]

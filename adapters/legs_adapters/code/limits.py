@@ -103,21 +103,23 @@ def _why_too_deep(text: str) -> str:
     here, outside = 0, 0  # parts since the last comma: in the innermost brackets, and in all around
     around: List[int] = []
     for found in _TOKEN.finditer(text):
-        kind, token = found.lastgroup, found.group()
-        if kind == "open":
+        kind = found.lastgroup
+        if kind == "signs":
+            here += len(found.group())
+        elif kind == "comma" or (kind == "end" and not around):
+            here = 0
+        elif kind == "open":
             around.append(here + 1)
             here, outside = 0, outside + here + 1
+            if len(around) > MAX_BRACKETS:
+                return f"brackets are nested more than {MAX_BRACKETS} deep"
         elif kind == "close" and around:
             here = around.pop()
             outside -= here
-        elif kind == "comma" or (kind == "end" and not around):
-            here = 0
+        elif kind == "word":
+            here += 1
         elif kind == "string":
-            here += 1 + max((len(field) // 2 for field in _FIELD.findall(token)), default=0)
-        elif kind in ("word", "signs"):
-            here += 1 if kind == "word" else len(token)
-        if len(around) > MAX_BRACKETS:
-            return f"brackets are nested more than {MAX_BRACKETS} deep"
+            here += 1 + max((len(field) // 2 for field in _FIELD.findall(found.group())), default=0)
         if outside + here > MAX_PARTS:
             return f"an expression of more than {MAX_PARTS} parts"
     return ""

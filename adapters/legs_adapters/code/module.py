@@ -175,8 +175,7 @@ class Module:
         self.budget: Budget = budget or Budget()
         self.text = text
         self.lines: Lines = Lines(text.encode("utf-8"))
-        outline, cuts = outline_part(self.lines)
-        self.outline: Part = outline
+        self.outline, cuts = outline_part(self.lines)
         self.outline_text: str = STUB.sub("0", self.outline.text.decode("utf-8"))
         self.failure: Optional[Unreadable] = None
         self.spend(parsing_steps(self.outline_text))

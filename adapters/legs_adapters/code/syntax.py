@@ -19,6 +19,7 @@ _PUNCTUATION = re.compile(
     "whitespace|[lr]par|[lr]brac|l.*_lines|lines_|trailing_|header|footer|comma|equal|dot|.*colon"
 )
 _NO_NODES = (str, bool, type(None), cst.MaybeSentinel)  # isinstance on every node is slow
+_SEVERAL = (list, tuple)
 _SCOPES = (cst.FunctionDef, cst.ClassDef)
 
 
@@ -121,8 +122,11 @@ def children(node: cst.CSTNode) -> List[cst.CSTNode]:
     found: List[Any] = []
     for name in _fields(type(node)):
         value = getattr(node, name)
-        found += value if isinstance(value, (list, tuple)) else (value,)
-    return [part for part in found if type(part) not in _NO_NODES]
+        if type(value) in _SEVERAL:
+            found += value
+        elif type(value) not in _NO_NODES:
+            found.append(value)
+    return found
 
 
 def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:

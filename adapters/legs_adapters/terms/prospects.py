@@ -15,7 +15,7 @@ from legs_adapters.code.module import CALLED
 from legs_adapters.lexicon.words import SPEAKS_OF_L1, SPEAKS_OF_LOSS
 from legs_adapters.tensors.operations import HOLDERS, MODULE_SELF
 
-_WORD = re.compile(r"(?<![\w\"'])[^\W\d]\w*(?![\"'])")  # no key, no setting: ``split="train"``
+_WORD = re.compile(r"[^\W\d](?<![\w\"'].)\w*(?![\"'])")  # no key, no setting: ``split="train"``
 _DEFINITION = re.compile(r"^([ \t]*)(?:async[ \t]+)?(def|class)[ \t]+(\w+)", re.M)
 # A value goes on where its line ends in an opening bracket, a comma or a backslash.
 _VALUE = r"((?:[^\n]*[\[({,\\][ \t]*(?:#[^\n]*)?(?:\n|\Z))*[^\n]*)"
@@ -32,7 +32,6 @@ _ADDED = re.compile(r"self(?<!\wself)\.(\w+)\.(?:append|add|extend|update|setdef
 _SINGLE_CALL = re.compile(r"(?<![\w.])([\w.]+)[ \t]*\((?:[^()]|\([^()]*\))*\)[ \t]*(?:#.*)?$")
 _RENAMED = re.compile(r"as(?<=[ \t]as)[ \t]+(\w+)")
 _LAST_WORD = re.compile(r"(?<!\w)\w*$")
-_WITH_L1 = re.compile(r"^.*[lL]1.*$", re.M)
 _DEFAULT = re.compile(
     r"\b(\w+)(?:[ \t]*:[^=,()\n]{1,200})?[ \t]*=[ \t]*([\w.]{0,99}[lL]1\w{0,99})(?![\w.]{0,99}[ \t]*\()"
 )
@@ -140,7 +139,7 @@ def _entries(text: str) -> Iterator[_Entry]:
     named = _ADDED.findall(text)
     for several, value in _UNPACKED.findall(text):
         yield from ((target, _NONE, _held(value)) for target in _TARGET.findall(several))
-    named += [found for line in _WITH_L1.findall(text) for found in _DEFAULT.findall(line)]
+    named += [found for line in text.split("\n") if "l1" in line.lower() for found in _DEFAULT.findall(line)]
     for match in _RENAMED.finditer(text):
         last = _LAST_WORD.search(text[max(match.start() - 80, 0) : match.start()].rstrip(" \t"))
         named.append((match.group(1), last.group() if last is not None else ""))

@@ -19,9 +19,8 @@ import libcst as cst
 
 from legs_adapters.code.module import Module
 from legs_adapters.code.parsing import read_by_python
-from legs_adapters.code.program import Program
 from legs_adapters.code.syntax import dotted
-from legs_adapters.terms.findings import Site, Use
+from legs_adapters.terms.findings import Findings
 from legs_adapters.terms.text import Edit, Text, apply_edits
 from legs_adapters.terms.writing import PACKAGE
 from legs_loss import LegsError
@@ -30,28 +29,24 @@ _STRINGS = (cst.SimpleString, cst.ConcatenatedString)
 _IMPORTS = (cst.Import, cst.ImportFrom)
 
 
-def rewrite(
-    program: Program, path: str, sites: Sequence[Site], unweighted: Sequence[Use] = (), in_place: bool = False
-) -> List[Edit]:
+def rewrite(findings: Findings, path: str, in_place: bool = False) -> List[Edit]:
     """Return the edits that give one file the LEGS loss.
 
     Args:
-        program, path: the checkout, and the file.
-        sites: its sites.
-        unweighted: its calls that are not weighted.
+        findings, path: what was found in the checkout, and the file.
         in_place: add no import, so that every line keeps its number: the file is run in memory, with the name built in.
 
     Raises:
         LegsError: the file has a legs_loss of its own; or the result would not compile (a bug of legs-patch).
         ValueError: this Python cannot compile the file, or it cannot be written back exactly.
     """
-    source, module = program.sources[path], program.module(path)
+    source, module = findings.program.sources[path], findings.program.module(path)
     assert module is not None
     is_imported = _is_imported(module)
     edits: List[Edit] = []
-    for site in sites:
+    for site in (each for each in findings.sites if each.path == path):
         edits += site.form.edits(Text(source, site.scope), site.writing(in_place))
-    for use in unweighted:
+    for use in (each for each, _ in findings.unweighted if each.caller.module.path == path):
         text = Text(source, use.caller)
         start, end = text.span(use.call.func, True)
         edits += [text.replace(start, start, f"{PACKAGE}.unweighted("), text.replace(end, end, ")")]

@@ -133,12 +133,10 @@ def _check_named(root: Path, findings: Findings, name: str, line: int, exclude: 
 def _edits(findings: Findings, in_place: bool) -> Dict[str, List[Edit]]:
     """Return the edits of each file. One that cannot be edited is given up, and the others are edited without it."""
     edits: Dict[str, List[Edit]] = {}
-    uses = [use for use, _ in findings.unweighted]
-    for name in sorted({site.path for site in findings.sites} | {use.caller.module.path for use in uses}):
-        sites = [site for site in findings.sites if site.path == name]
-        unweighted = [use for use in uses if use.caller.module.path == name]
+    calling = {use.caller.module.path for use, _ in findings.unweighted}
+    for name in sorted({site.path for site in findings.sites} | calling):
         try:
-            edits[name] = rewrite(findings.program, name, sites, unweighted, in_place)
+            edits[name] = rewrite(findings, name, in_place)
             continue
         except RecursionError:
             why = "is nested too deeply"

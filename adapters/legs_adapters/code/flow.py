@@ -164,7 +164,9 @@ class Flow:
             is_starred = any(isinstance(element, cst.StarredElement) for element in target.elements)
             parts = value.elements if isinstance(value, (cst.Tuple, cst.List)) and kind == "assign" else ()
             # In [a, b], c = f() neither a nor b is the first result of f: they are parts of it.
-            inner = "part" if kind == "element" and index is not None and not _counts(value) else "element"
+            # What they iterate over together is no element that is unpacked: for i, (a, b) in enumerate(pairs).
+            counts = isinstance(value, cst.Call) and call_name(value) in ("enumerate", "zip")
+            inner = "part" if kind == "element" and index is not None and not counts else "element"
             for i, element in enumerate(target.elements):
                 if not is_starred and len(parts) == len(target.elements):
                     self._assign(env, element.value, parts[i].value, node)
@@ -380,8 +382,3 @@ class Flow:
         self._assign(env, node.target, node.iter, node, "element")
         for part in (*node.ifs, *filter(None, [node.inner_for_in])):
             self._visit(part, env)
-
-
-def _counts(value: Optional[cst.CSTNode]) -> bool:
-    """Return whether a loop iterates over several things together: ``enumerate(...)``, ``zip(...)``."""
-    return isinstance(value, cst.Call) and call_name(value) in ("enumerate", "zip")

@@ -104,8 +104,8 @@ def _why_too_deep(text: str) -> str:
     around: List[int] = []
     for found in _TOKEN.finditer(text):
         kind = found.lastgroup
-        if kind == "signs":
-            here += len(found.group())
+        if kind in ("signs", "word"):
+            here += len(found.group()) if kind == "signs" else 1
         elif kind == "comma" or (kind == "end" and not around):
             here = 0
         elif kind == "open":
@@ -116,8 +116,6 @@ def _why_too_deep(text: str) -> str:
         elif kind == "close" and around:
             here = around.pop()
             outside -= here
-        elif kind == "word":
-            here += 1
         elif kind == "string":
             here += 1 + max((len(field) // 2 for field in _FIELD.findall(found.group())), default=0)
         if outside + here > MAX_PARTS:

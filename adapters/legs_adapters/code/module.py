@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Callable, Dict, FrozenSet, Iterable, Iterator, List, Optional, Sequence, Tuple, TypeVar
+from typing import Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, TypeVar
 
 import libcst as cst
 
@@ -18,6 +18,7 @@ CALLED = ("forward", "__call__")  # what calling an instance runs: a torch modul
 
 _T = TypeVar("_T")
 _WORD = re.compile(r"\w+(?:\s*\()?")  # a word, and whether it is called
+# What a text may store; for what it only reads, its function is not parsed.
 # Neither called nor read through an attribute, and behind it an assignment, an ``in``, a colon or a line that goes on.
 _STORED = re.compile(
     rf"self\.(\w+)(?:(?=\.(?:{'|'.join(sorted(MUTATORS))}|\w+_)[ \t]*\()|(?!\w|[ \t]*[.(])"
@@ -74,12 +75,6 @@ class Function:
                 before = self.module.lines.place(self._cut.start, self._cut.start).line - 2
                 self.module.failure = _failure(self.module.path, self.module.text, error, before)
         return self.node if isinstance(self.node, cst.Module) else self.node.body
-
-    @property
-    @remembered
-    def stored(self) -> FrozenSet[str]:
-        """The attributes of ``self`` that its text may store: for those that it only reads it is not parsed."""
-        return frozenset(_STORED.findall(self.text))
 
     @property
     @remembered
@@ -152,9 +147,11 @@ class Class:
         self.name: str = node.name.value
         self.methods: Dict[str, Function] = {}
 
+    @remembered
     def stores(self, attribute: str, where: Callable[[Function], bool] = bool) -> List[Tuple[Function, Definition]]:
         """Return what its methods (those of which ``where`` is true) assign to ``self.attribute``."""
-        methods = [method for method in self.methods.values() if attribute in method.stored and where(method)]
+        mentions = [method for method in self.methods.values() if f"self.{attribute}" in method.text]
+        methods = [each for each in mentions if attribute in _STORED.findall(each.text) and where(each)]
         found = [(method, d) for method in methods for d in method.flow.definitions.get(f"self.{attribute}", ())]
         # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
         return [(method, made) for method, made in found if not str(made.key).startswith(".")]

@@ -19,7 +19,6 @@ _PUNCTUATION = re.compile(
     "whitespace|[lr]par|[lr]brac|l.*_lines|lines_|trailing_|header|footer|comma|equal|dot|.*colon"
 )
 _NO_NODES = (str, bool, type(None), cst.MaybeSentinel)  # isinstance on every node is slow
-_SEVERAL = (list, tuple)
 _SCOPES = (cst.FunctionDef, cst.ClassDef)
 
 
@@ -122,10 +121,8 @@ def children(node: cst.CSTNode) -> List[cst.CSTNode]:
     found: List[Any] = []
     for name in _fields(type(node)):
         value = getattr(node, name)
-        if type(value) in _SEVERAL:
-            found += value
-        elif type(value) not in _NO_NODES:
-            found.append(value)
+        if type(value) not in _NO_NODES:
+            found += value if type(value) in (list, tuple) else (value,)
     return found
 
 

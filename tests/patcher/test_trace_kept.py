@@ -149,6 +149,27 @@ LOOP
     loss = loss + 0.1 * F.l1_loss(drawn["normal"], camera.values["normals"])
 STEP
 """,
+    "a gradient that is only read, beside one that is applied": """
+importance = torch.zeros_like(splats.opacity)
+leaves = [splats.xy, splats.colour, splats.opacity]
+LOOP
+    (slope,) = torch.autograd.grad(F.l1_loss(drawn["rgb"], gt_image), [splats.opacity])  # <- quoted
+    importance += slope.abs()
+    loss = F.l1_loss(splats.draw(camera)["rgb"], gt_image)  # <- here
+    for leaf, slope in zip(leaves, torch.autograd.grad(loss, leaves)):
+        leaf.grad = slope
+    splats.optimizer.step()
+""",
+    "a difference that has a name": """
+def masked(drawn, target):
+    delta = drawn["rgb"] - target
+    return 0.8 * delta.abs().mean()  # <- quoted
+
+
+LOOP
+    loss = masked(drawn, gt_image)
+STEP
+""",
     "photographs of an HDF5 file": """
 import h5py
 

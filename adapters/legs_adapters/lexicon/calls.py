@@ -6,7 +6,7 @@ torch's operations do, then what a name says, then what the arguments are, then 
 
 from __future__ import annotations
 
-from typing import Callable, Dict, List, Optional
+from typing import Callable, List, Optional
 
 import libcst as cst
 
@@ -63,8 +63,6 @@ class CallReading:
         self.node = node
         self.meaning_of = meaning_of
         self.name: str = call_name(node)
-        self.positional: List[cst.BaseExpression]
-        self.keywords: Dict[str, cst.BaseExpression]
         self.positional, self.keywords, _ = arguments(node)
         self.values: List[cst.BaseExpression] = [*self.positional, *self.keywords.values()]
         base = node.func.value if isinstance(node.func, cst.Attribute) else None
@@ -99,7 +97,7 @@ def _reduced(call: CallReading) -> Optional[Meaning]:
     of = call.owner or next(iter(call.positional), None)
     positional = call.positional if call.owner is not None else call.positional[1:]
     axes = [*positional, *(value for name, value in call.keywords.items() if name in ("dim", "axis"))]
-    if call.name in REDUCES and all(isinstance(constant(axis), tuple) for axis in axes):
+    if call.name in REDUCES | EXTREMES and all(isinstance(constant(axis), tuple) for axis in axes):
         return Meaning("parameter", None)
     made = of and (call.function.flow.value_of(of) or of)
     is_joined = isinstance(made, cst.Call) and call_name(made) in JOINS  # the mean of several pictures

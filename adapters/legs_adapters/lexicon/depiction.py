@@ -32,7 +32,7 @@ from legs_adapters.code.syntax import (
 from legs_adapters.lexicon.calls import CallReading, is_of_neighbours, meaning_of_call, picked_from
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning, mix, more_special
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
-from legs_adapters.lexicon.words import BACKGROUND, COLORS, DATA, KIND_OF, LOSS, RENDER
+from legs_adapters.lexicon.words import BACKGROUND, DATA, KIND_OF, LOSS, RENDER
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.operations import CONCATENATES
 
@@ -95,15 +95,17 @@ class Meanings:
             return Meaning("mask", None)
         if is_of_neighbours(node, function.flow.value_of):
             return Meaning("gradient", self.meaning(function, node.left).role)  # type: ignore[attr-defined]
-        return mix((self.meaning(function, part) for part in parts_of(node)), isinstance(node, cst.BinaryOperation))
+        parts = [self.meaning(function, part) for part in parts_of(node)]
+        is_change = isinstance(getattr(node, "operator", None), cst.Subtract) and len(parts) == 2
+        if is_change and parts[0] == parts[1] and parts[0].kind == "image" and parts[0].role:  # of two views or moments
+            return Meaning("gradient", parts[0].role)
+        return mix(parts, isinstance(node, cst.BinaryOperation))
 
     def _name(self, function: Function, node: cst.Name, flow: Meaning) -> Meaning:
         """Return the meaning of a name, of its words and of what is assigned to it."""
         shown = "image_" if flow.kind == "image" else ""
         kind, role = kind_of_words(shown + node.value), role_of_words(node.value)
         role = role or flow.role
-        if flow.kind == "feature" and kind == "image" and COLORS & set(words(node.value)):
-            return Meaning("image", role)  # `rgb = outputs["features"]`: colours, there
         if kind == "mask" and flow.kind in ("flow", "depth", "channel"):
             return Meaning("mask", role)  # motion_masks, alpha = depth_sil[1]: to be laid over a rendering
         return Meaning(more_special(kind, flow.kind), role)

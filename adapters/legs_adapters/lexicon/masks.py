@@ -22,8 +22,6 @@ def is_mask(meanings: Meanings, function: Function, element: cst.SubscriptElemen
     node = element.slice.value
     if isinstance(node, (cst.Comparison, cst.UnaryOperation)):
         return constant(node) is None
-    if isinstance(node, cst.BinaryOperation):
-        return isinstance(node.operator, (cst.BitAnd, cst.BitOr, cst.BitXor))
     name = node.value if isinstance(node, cst.Name) else node.attr.value if isinstance(node, cst.Attribute) else ""
     return bool(set(words(name)) & PICKING) or meanings.meaning(function, node).kind == "mask"
 

@@ -30,8 +30,6 @@ def mix(parts: Iterable[Meaning], computed: bool = False) -> Meaning:
     """
     laid_over = (None, "mask", "parameter", *(("feature", "flow") if computed else ()))
     known = [part for part in parts if part != UNKNOWN]
-    if computed and {part.kind for part in known} == {None, "mask"}:
-        known = [part for part in known if part.kind is None]  # pred * mask
     known = [part for part in known if part.kind not in laid_over] or known
     kinds = [part.kind for part in known if part.kind is not None]
     roles = {part.role for part in known if part.role is not None}

@@ -11,13 +11,13 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.reaching import Definition, Reaching
-from legs_adapters.code.syntax import attribute_chain, call_name, code, constant, root_of, words, words_in
+from legs_adapters.code.syntax import attribute_chain, code, constant, root_of, words, words_in
 from legs_adapters.lexicon.calls import CallReading, meaning_of_call, meaning_returned
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.meaning import UNKNOWN, Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.words import BACKGROUND, DATA, GAUSSIANS, RENDERERS, SPLATS
-from legs_adapters.tensors.operations import PICTURE_FUNCTIONS, VIEWS
+from legs_adapters.tensors.operations import VIEWS
 
 RENDERING = Meaning("image", "render")
 PHOTOGRAPH = Meaning("image", "target")
@@ -80,12 +80,9 @@ class Ways(Meanings):
         names = [root_of(part) for part in chain if isinstance(part, (cst.Name, cst.Attribute))]
         if "warp" in map(kind_of_words, names):
             return False
-        root, call = chain[-1], chain[-2] if len(chain) > 1 else None
         if any(DATA & set(words(name)) for name in names):
             return "render" not in map(role_of_words, names)
-        if isinstance(call, cst.Call) and call.args and call_name(call) in PICTURE_FUNCTIONS:
-            return self._holds_data(function, call.args[0].value)
-        found = self.program.lookup(function, root)
+        found = self.program.lookup(function, chain[-1])
         return found is not None and self._holds_data(*found)
 
     # -- definitions

@@ -124,9 +124,8 @@ SPLATS = re.compile(r"splat|gaussians|gaussian_?(model|render|scene|raster)|diff
 DRAWS_SPLATS = re.compile(SPLATS.pattern + r"|rasteriz|render_pkg", re.I)
 # Rays of a NeRF: nerfstudio's bundles, rays_o and rays_d of others, and what renders a field.
 RAYS = re.compile(
-    r"rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid|radiance_?field"
-    r"|(octree|voxel|volume|volumetric|nerf)_?(render|raster)",
-    re.I,
+    r"(?i)rays_[od]\b|ray_?bundle|ray_?samples|RaySampler|rays_valid|radiance_?field"
+    r"|(octree|voxel|volume|volumetric|nerf)_?(render|raster)"
 )
 OF_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
 STRUCTURAL = re.compile("ssim", re.I)

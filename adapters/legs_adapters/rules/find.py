@@ -64,7 +64,7 @@ def find(
     with progress(len(named), "files read") as bar:  # half of a file when it is parsed, half when it was judged
         program.when_read = lambda path: bar.update(0.5 * (path in named))
         analysis = Analysis(program)
-        found = _Search(analysis, by_hand, bar).run()
+        found = _Search(analysis, by_hand, named, bar).run()
     found = with_trace(found, analysis, trace) if trace is not None and not by_hand else found
     left = found.left
     found = with_ssims(found, analysis, by_hand) if ssim or masks else found
@@ -73,8 +73,8 @@ def find(
 
 
 class _Search:
-    def __init__(self, analysis: Analysis, by_hand: Sequence[Tuple[str, int]], bar: Any) -> None:
-        self.analysis = analysis
+    def __init__(self, analysis: Analysis, by_hand: Sequence[Tuple[str, int]], named: Set[str], bar: Any) -> None:
+        self.analysis, self.named = analysis, named
         self.bar = bar
         self.by_hand: Dict[str, List[int]] = {}  # the lines that the user named, by their file
         for path, line in dict.fromkeys(by_hand):
@@ -86,9 +86,8 @@ class _Search:
     def run(self) -> Findings:
         found, program = self.found, self.analysis.program
         may_have = self.analysis.prospects.may_have  # of an L1 that its callers do not name so
-        named = set(program.paths_matching(_MAY_HAVE_L1))
         for module in program.matching(_TO_READ):
-            is_named = module.path in named
+            is_named = module.path in self.named
             if not is_named and not may_have(module.text):
                 continue
             self.bar.update(0.5 * is_named)

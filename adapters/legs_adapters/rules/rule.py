@@ -45,8 +45,6 @@ class Term:
         self.here: List[Decider] = [(function, form.node)]
         self.pair: Pair = pair_of(analysis.meanings, analysis.ways, function, form)
         sides = self.pair.first, self.pair.second
-        self.target: cst.BaseExpression
-        self.prediction: cst.BaseExpression
         self.target, self.prediction = sides if swapped(self.pair.a, self.pair.b) else sides[::-1]
 
     @property

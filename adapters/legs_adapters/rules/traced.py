@@ -98,7 +98,7 @@ class _Join:
 
     def _form(self, function: Function, line: int, inner: Optional[Frame]) -> Optional[Form]:
         for form in self.analysis.forms.in_function(function):
-            if _on(function, form.node, line):
+            if any(_on(function, node, line) for node in (form.node, getattr(form, "difference", None)) if node):
                 return form
         for call in function.flow.calls if inner is not None and self._is_pair(inner) else ():
             values, keywords, starred = arguments(call)
@@ -141,11 +141,13 @@ class _Join:
             self.settled.add((read.path, read.line))
             return [read._replace(why=traced.text(self._name(traced, stack)))]
         own = [c for c in stack if (c.function.module.path, c.function.name) not in self.trace.scripted]
-        for candidate in sorted(own, key=self._is_definition):
+        is_read = any(self.analysis.training.scores(candidate.form.node) for candidate in own)
+        for candidate in sorted(own, key=self._is_definition) if not is_read else ():
             uses = self._others(candidate)
             if uses is not None:
                 return [] if candidate.key in self.settled else [self._weighted(traced, candidate, uses)]
         why = "serves other terms of the trace, too" if own else "no call or difference of the two pictures is there"
+        why = "nothing shows that its gradient is more than read" if is_read else why
         advice = "give the term of the photograph a line of its own, legs_loss.l1_loss(rendering, photograph)"
         return [self._quoted(traced, stack, why, advice, min(own, key=self._is_definition).depth if own else 0)]
 
@@ -198,13 +200,13 @@ class _Join:
 
     def _use(self, traced: Traced, depth: int, candidate: _Candidate, losses: Set[_Place]) -> Optional[Use]:
         """Return the call that led a term into the function of a form, and no photometric one."""
-        frame = traced.frames[depth + 1] if depth + 1 < len(traced.frames) else None
-        caller = None if frame is None or frame[:2] in losses else self._function(frame)
-        if caller is None or frame is None:
-            return None
-        for call in caller.flow.calls:
-            if _on(caller, call, frame.line) and call_name(call) == candidate.function.name:
-                return Use(caller, call, Evidence("", traced.text(self._name(traced, [])), ()), True)
+        for frame in traced.frames[depth + 1 : depth + 2]:
+            caller = self._function(frame)
+            if caller is not None and frame[:2] not in losses:
+                calls = [call for call in caller.flow.calls if _on(caller, call, frame.line)]
+                why = Evidence("", traced.text(self._name(traced, [])), ())
+                uses = [Use(caller, call, why, True) for call in calls if call_name(call) == candidate.function.name]
+                return next(iter(uses), None)
         return None
 
     def _other(self, traced: Traced, stack: List[_Candidate]) -> None:

@@ -84,10 +84,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"legs-loss {__version__}")
     parser.offer_completion()
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    modules: Dict[str, Callable[[], Any]] = {
-        name: functools.partial(importlib.import_module, f"{__name__}.{name}") for name in COMMANDS
-    }
-    for name, load in {**modules, **plugins("legs_loss.commands")}.items():
+    own = {name: functools.partial(importlib.import_module, f"{__name__}.{name}") for name in COMMANDS}
+    loaders: Dict[str, Callable[[], Any]] = {**own, **plugins("legs_loss.commands")}
+    for name, load in loaders.items():
         command = load()
         sub = commands.add_parser(name, help=command.HELP, description=command.__doc__, epilog=EXIT_CODES)
         command.add_arguments(sub)

@@ -42,14 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = "a folder of masks, one for all, the photographs' own alpha, or those that transforms.json names"
     parser.add_argument("--masks", metavar="DIR|FILE|alpha|mask_path", help=what)
     parser.add_argument("--weights", metavar="DIR", help="a folder of weights, .npy too, that multiply the preset's")
-    parser.add_argument(
-        "--weight_scale", type=float, default=1.0, metavar="W", help="of --weights: what white stands for; default: 1"
-    )
+    what = "of --weights: what white stands for; default: 1"
+    parser.add_argument("--weight_scale", type=float, default=1.0, metavar="W", help=what)
     what = "the store's folder, or for several scenes the folder of their stores"
     parser.add_argument("--out", metavar="DIR", help=f"{what}; default: SCENE/legs_weights, where a training finds it")
-    parser.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of a dask cluster that shares the file system; a scene is a task"
-    )
+    what = "of a dask cluster that shares the file system; a scene is a task"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=what)
     what = f"processes per scene; default: one per core ({cores()}), with --scheduler 1"
     parser.add_argument("--workers", type=int, metavar="N", help=what)
 
@@ -177,8 +175,6 @@ def _say_where(tasks: Iterable[SceneTask]) -> None:
 
     away = [task for task in tasks if task.store != task.scene / STORE_FOLDER]
     if away:
-        say(
-            f"legs: note: a training that is given the scene looks in {away[0].scene / STORE_FOLDER}, not there: name "
-            f"the store with LEGS_STORE={shlex.quote(str(away[0].store))}, or as `store` in legs.toml",
-            sys.stderr,
-        )
+        where, store = away[0].scene / STORE_FOLDER, shlex.quote(str(away[0].store))
+        how = f"name the store with LEGS_STORE={store}, or as `store` in legs.toml"
+        say_notes([f"a training that is given the scene looks in {where}, not there: {how}"])

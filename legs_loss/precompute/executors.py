@@ -15,6 +15,7 @@ import signal
 import uuid
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Callable, Dict, Generator, Iterable, Iterator, Optional, Tuple
@@ -184,10 +185,8 @@ def _on_cluster(task: Work, arguments: Iterable[Any], scheduler: str, listen: Li
             raise LegsError(f"the scheduler {scheduler} has no workers: start some with `dask worker`") from None
         topic = f"legs-{uuid.uuid4().hex}"
         client.subscribe_topic(topic, lambda event: listen(event[1]))
-        futures = {
-            client.submit(_on_worker, __version__, task, argument, topic, pure=False): argument
-            for argument in arguments
-        }
+        submit = partial(client.submit, _on_worker, __version__, task, topic, pure=False)
+        futures = {submit(argument): argument for argument in arguments}
         for future in as_completed(futures, loop=client.loop):
             yield futures[future], _outcome_there(future)
 
@@ -205,7 +204,7 @@ def _outcome_there(future: Any) -> Any:
         return LegsError(f"a worker could not run it: {error}")
 
 
-def _on_worker(version: str, task: Work, argument: Any, topic: str) -> Any:
+def _on_worker(version: str, task: Work, topic: str, argument: Any) -> Any:
     """Run a task; errors name the worker."""
     from distributed import get_worker
 

@@ -54,6 +54,5 @@ def levels_of(images: Iterable[torch.Tensor], spec: WeightSpec) -> Optional[torc
     """Return the levels of a scene's images [C, H, W], [2]; None for a spec that is not normalised over the scene."""
     if spec.over != "scene":
         return None
-    return scene_levels(
-        response_levels(response(image, spec.operator, spec.p, False, spec.smooth), spec) for image in images
-    )
+    strengths = (response(image, spec.operator, spec.p, False, spec.smooth) for image in images)
+    return scene_levels(response_levels(strength, spec) for strength in strengths)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Dict, Iterable, List, Sequence, Tuple, Type
 
@@ -140,11 +141,9 @@ def _unit(values: np.ndarray, white: int) -> np.ndarray:
 
 def _has_alpha(path: Path) -> bool:
     """Return whether a photograph has an alpha channel, from its header; one that cannot be read has none."""
-    try:
-        with open_image(path) as image:
-            return not image.mode.startswith(("I", "F")) and colour_mode(image) == "RGBA"
-    except LegsError:
-        return False
+    with suppress(LegsError), open_image(path) as image:
+        return colour_mode(image) == "RGBA"
+    return False
 
 
 def file_names(views: Iterable[str]) -> Dict[str, str]:

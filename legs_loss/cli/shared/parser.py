@@ -37,12 +37,9 @@ class Parser(argparse.ArgumentParser):
 
     def offer_completion(self) -> None:
         """Add ``--print-completion``, which prints a shell's completion script for this command."""
-        self.add_argument(
-            "--print-completion",
-            action=_PrintCompletion,
-            choices=("bash", "zsh", "tcsh"),
-            help="print the completion script of a shell, for its start-up file; needs shtab",
-        )
+        what = "print the completion script of a shell, for its start-up file; needs shtab"
+        shells = ("bash", "zsh", "tcsh")
+        self.add_argument("--print-completion", action=_PrintCompletion, choices=shells, help=what)
 
 
 class _PrintCompletion(argparse.Action):

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Callable, Dict, Iterator, List, NamedTuple, Optional, Tuple
+from typing import Any, BinaryIO, Callable, Dict, Iterator, List, Optional, Tuple
 
 import numpy as np
 
@@ -33,12 +33,7 @@ _FARTHEST_CAMERA = 1e12  # in the scene's unit: what float32 can still compute w
 
 
 _Lens = Tuple[str, Optional[Camera]]  # the model's name; a pinhole as it stands in the origin
-
-
-class _Image(NamedTuple):
-    name: str
-    camera_id: int
-    pose: np.ndarray  # [4, 4], world -> camera
+_Image = Tuple[str, int, np.ndarray]  # its name, its camera's number, and [4, 4], world -> camera
 
 
 def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
@@ -55,17 +50,15 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
     cameras_file, points_file = (file.with_name(f"{what}{file.suffix}") for what in ("cameras", "points3D"))
     cameras = _read(cameras_file)
     views = []
-    for image in _read(file):
-        if image.camera_id not in cameras:
-            raise LegsError(
-                f"{file}: {image.name!r} has camera {image.camera_id}, which {cameras_file.name} does not list"
-            )
-        name = image.name.replace("\\", "/")
+    for listed_name, number, pose in _read(file):
+        if number not in cameras:
+            raise LegsError(f"{file}: {listed_name!r} has camera {number}, which {cameras_file.name} does not list")
+        name = listed_name.replace("\\", "/")
         path = images / name
         if not os.path.isfile(str(path)) and os.path.isfile(str(images / path.name)):  # pathlib's raise for some names
             path, name = images / path.name, path.name
-        model, pinhole = cameras[image.camera_id]
-        camera = None if pinhole is None else replace(pinhole, world_to_camera=image.pose)
+        model, pinhole = cameras[number]
+        camera = None if pinhole is None else replace(pinhole, world_to_camera=pose)
         views.append(View(f"{prefix}{name}", path, camera, camera_model=model))
     points = partial(_read, points_file) if points_file.is_file() else None
     return Scene(root, "colmap", tuple(views), points, notes=_larger_models(root, file.parent, len(views)))
@@ -241,7 +234,7 @@ def _image(_: Any, w: Any, x: Any, y: Any, z: Any, tx: Any, ty: Any, tz: Any, ca
         raise ValueError(f"the pose of {name!r} is not a number")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = _rotation(quaternion), translation
-    return _Image(name, int(camera_id), pose)
+    return name, int(camera_id), pose
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:

@@ -43,6 +43,8 @@ def read_scene(path: Union[str, Path], images: Optional[str] = None) -> Scene:
         scene = (read_colmap if is_colmap else read_folder)(root, *_images_folder(root, images or "images"))
     else:
         scene = read_folder(root, root, "")
+    if not scene.views:
+        raise LegsError(f"{root} has no photographs: its {scene.kind} files list none")
     return replace(scene, images=images, views=tuple(sorted(scene.views, key=lambda view: view.name)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from contextlib import suppress
 from dataclasses import replace
@@ -43,8 +44,7 @@ def read_colmap(root: Path, images: Path, prefix: str) -> Scene:
     as 3DGS does, under the last part of it; ``prefix`` goes before its name in :class:`View`. Cameras other than
     PINHOLE and SIMPLE_PINHOLE leave ``View.camera`` None. Raises :class:`LegsError` when the model is damaged.
     """
-    listed = [_images_file(folder) for folder in (root / "sparse" / "0", root / "sparse")]
-    file = next((file for file in listed if file.is_file()), None)
+    file = next((one for one in map(_images_file, (root / "sparse" / "0", root / "sparse")) if one.is_file()), None)
     if file is None:
         raise LegsError(f"{root} has no COLMAP model: there is no sparse/0/images.bin or .txt")
     cameras_file, points_file = (file.with_name(f"{what}{file.suffix}") for what in ("cameras", "points3D"))
@@ -165,7 +165,8 @@ Lines = Iterator[Tuple[int, str]]  # with their numbers
 
 def _rows(text: str, layout: str, read: Callable[[str, Lines], Any]) -> List[Any]:
     """Return what is read of the lines that are no comments and not empty; ``read`` may take further ones."""
-    lines = ((n, line) for n, line in enumerate(text.split("\n"), 1) if not line.startswith("#"))
+    # Not by splitlines(), which also ends a line at characters that a name may have.
+    lines = ((n, line) for n, line in enumerate(re.split(r"\r\n?|\n", text), 1) if not line.lstrip().startswith("#"))
     rows = []
     for number, line in lines:
         if line.strip():

@@ -64,8 +64,7 @@ def _read_file(root: Path, file: Path) -> Iterator[View]:
         intrinsics = {**common, **frame}
         model = _model(intrinsics)
         camera = _camera(intrinsics, root / name) if model in ("PINHOLE", "SIMPLE_PINHOLE") else None
-        mask = intrinsics.get("mask_path")
-        mask = None if mask is None else root / _image_name(root, mask)
+        mask = root / _image_name(root, intrinsics["mask_path"]) if intrinsics.get("mask_path") else None
         yield View(name, root / name, camera, one_split or splits.get(name), model, True, mask)
 
 
@@ -76,7 +75,7 @@ def _image_name(root: Path, file_path: str) -> str:
     name = posixpath.normpath(file_path.replace("\\", "/"))
     if os.path.isabs(name):
         name = Path(os.path.relpath(name, str(root.resolve()))).as_posix()
-    for suffix in ("", *SUFFIXES):
+    for suffix in ("", *SUFFIXES, *map(str.upper, SUFFIXES)):
         if (root / f"{name}{suffix}").is_file():
             return f"{name}{suffix}"
     return name

@@ -111,6 +111,19 @@ class TestColmapText:
         assert [view.path.name for view in scene.views] == ["b.png", "c.png", "a.png"]
         assert scene.views[0].camera.fx == 50 and scene.points.xyz.shape == (2, 3)
 
+    @pytest.mark.parametrize("ending", ["\r\n", "\r"])
+    def test_line_endings_of_other_systems(self, tmp_path, ending):
+        root = text_scene(tmp_path)
+        for file in (root / "sparse" / "0").iterdir():
+            file.write_bytes(file.read_text().replace("\n", ending).encode())
+        assert [view.path.name for view in read_scene(root).views] == ["b.png", "c.png", "a.png"]
+
+    def test_a_comment_may_be_indented_as_colmap_reads_it(self, tmp_path):
+        root = text_scene(tmp_path)
+        for file in (root / "sparse" / "0").iterdir():
+            file.write_text(file.read_text().replace("# a comment", " \t# a comment"))
+        assert len(read_scene(root).views) == 3 and read_scene(root).points.xyz.shape == (2, 3)
+
     def test_another_encoding_is_named_with_its_line(self, tmp_path):
         root = text_scene(tmp_path)
         (root / "sparse" / "0" / "images.txt").write_bytes(b"# \xc3\xa9\n1 0 1 0 0 1 2 3 1 caf\xe9.png\n\n")
@@ -396,6 +409,13 @@ class TestTransforms:
         (view,) = read_scene(tmp_path).views
         assert (view.name, view.camera) == ("train/r_0", None)
 
+    @pytest.mark.parametrize("ending", ["png", "PNG", "JPG", "webp"])
+    def test_an_ending_that_is_not_written_is_that_of_the_file(self, tmp_path, ending):
+        save(tmp_path / "images" / f"a.{ending}", photograph(40, 30))
+        transforms(tmp_path, camera_angle_x=1.0, frames=[frame("images/a")])
+        (view,) = read_scene(tmp_path).views
+        assert (view.name, view.path.is_file(), view.camera.width) == (f"images/a.{ending}", True, 40)
+
     @pytest.mark.parametrize(
         "text",
         [
@@ -462,6 +482,14 @@ class TestFolder:
         (tmp_path / "images").mkdir()
         with pytest.raises(LegsError, match=r"images\.bin"):
             read_scene(tmp_path)
+
+
+def test_a_scene_that_lists_no_photograph_is_none(tmp_path):
+    root = text_scene(tmp_path / "colmap")
+    (root / "sparse" / "0" / "images.txt").write_text("# Number of images: 0\n")
+    for scene in (root, transforms(tmp_path / "transforms", camera_angle_x=1.0, frames=[])):
+        with pytest.raises(LegsError, match=r"has no photographs: its .* files list none"):
+            read_scene(scene)
 
 
 def test_resized_camera_sees_the_same():

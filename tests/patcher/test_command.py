@@ -381,6 +381,15 @@ class TestCommandLine:
         assert (root / "legs.toml").read_text() == "beta = 3.0\n"
 
 
+def test_a_line_of_another_framework_is_not_offered(tmp_path, run):
+    text = "import mlx.core as mx\nfrom gaussian_renderer import render\n\n\ndef loss_fn(gaussians, cam):\n"
+    text += "    image = render(cam, gaussians, None, None)\n    return mx.mean(mx.abs(image - cam.original_image))\n"
+    done = run(checkout(tmp_path, {**files("inria"), "train.py": text}))
+    assert "no photometric L1 term was found" in done.stderr
+    assert "train.py:1: MLX is imported" in done.stderr
+    assert "take it with" not in done.stderr
+
+
 @pytest.mark.parametrize(
     ("text", "line", "what"),
     [

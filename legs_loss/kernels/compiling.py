@@ -50,8 +50,10 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function that only compiled functions call: Python must not, since it gets no entry for Python.
 
     The machine code of all that a function calls is made once more with it, so few of them lie one within the other.
+    References to arrays are not counted in it, since that locks memory twice a slice; a part that makes an array has
+    to be given `_nrt=True`, as numba calls it.
     """
-    return compiled(no_cpython_wrapper=True, **options)
+    return compiled(**{"no_cpython_wrapper": True, "_nrt": False, **options})
 
 
 def inlined(function: Callable[..., Any]) -> Any:

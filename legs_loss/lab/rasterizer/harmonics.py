@@ -124,7 +124,7 @@ def _direction_gradient(coefficients, rows):
         store(rows, (TO + k) * LANES, _row(rows, TO + k) - along * _row(rows, MONOMIAL + 1 + k))
 
 
-@part()
+@part(_nrt=True)
 def shade(drawn, count, means, position, degree, sh, clamped, splats, column):
     """Fill Gaussians' colours as seen from `position`, and which of their channels are clamped at 0.
 
@@ -151,7 +151,7 @@ def shade(drawn, count, means, position, degree, sh, clamped, splats, column):
                 splats[i, column + channel] = max(value, np.float32(0))
 
 
-@part()
+@part(_nrt=True)
 def shade_gradient(drawn, count, means, position, degree, sh, clamped, colours, g_means, g_sh):
     """Fill the gradients to Gaussians' coefficients from those to their colours, and add to those of their means.
 

@@ -20,6 +20,7 @@ _TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
     **{"double": "f8", "float64": "f8"},
 }
+_ORDERS = {"format binary_little_endian 1.0": "<", "format binary_big_endian 1.0": ">"}
 _LARGEST = 64 << 30  # bytes: some 270 million Gaussians
 
 
@@ -53,7 +54,7 @@ def read_ply(path: Union[str, Path]) -> Gaussians:
 
     Raises:
         LegsError: not a binary .ply of Gaussians, the message names the property that is missing; or its size is not
-            what the header says.
+            what the header says; or a value is NaN.
     """
     try:
         data = read_regular(path, _LARGEST)
@@ -61,13 +62,11 @@ def read_ply(path: Union[str, Path]) -> Gaussians:
         raise LegsError(f"{path}: cannot be read ({error.strerror})") from None
     end = _END.search(data)
     lines = data[: end.start() if end else 0].decode("ascii", errors="replace").splitlines()
-    if lines[:1] != ["ply"] or lines[1:2] not in (
-        ["format binary_little_endian 1.0"],
-        ["format binary_big_endian 1.0"],
-    ):
+    order = _ORDERS.get(" ".join(lines[1:2]))
+    if lines[:1] != ["ply"] or order is None:
         what = "a text; save it as a binary" if lines[1:2] == ["format ascii 1.0"] else "not a binary"
         raise LegsError(f"{path}: {what} .ply")
-    count, kind = _parse_header(path, lines[2:], "<" if "little" in lines[1] else ">")
+    count, kind = _parse_header(path, lines[2:], order)
     names = kind.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
     coefficients = {3 * (k - 1): k for k in (1, 4, 9, 16)}.get(rest, 0)
@@ -79,13 +78,14 @@ def read_ply(path: Union[str, Path]) -> Gaussians:
     body = memoryview(data)[end.end() if end else 0 :]
     if len(body) != count * kind.itemsize:
         raise LegsError(
-            f"{path}: the header says {count} Gaussians of {kind.itemsize} bytes, but {len(body)} bytes follow: "
-            "the file is cut off or damaged"
+            f"{path}: cut off or damaged: the header says {count} of {kind.itemsize} bytes, {len(body)} follow"
         )
     table = np.frombuffer(body, kind)
     columns = np.empty((count, len(needed)), np.float32)
     for i, name in enumerate(needed):
         columns[:, i] = table[name]
+    if np.isnan(columns).any():
+        raise LegsError(f"{path}: {np.isnan(columns).any(1).sum()} Gaussian(s) have values that are NaN")
     parts = torch.from_numpy(columns).split([3, 3, 3 * (coefficients - 1), 1, 3, 4], dim=1)
     means, dc, rests, logits, log_scales, quaternions = (part.contiguous() for part in parts)
     rests = rests.reshape(count, 3, coefficients - 1).transpose(1, 2)

@@ -47,8 +47,9 @@ def l1_loss(
             as in ``torch.abs(prediction - target)``.
         view: the name of the view, or its number (for a batch: one a view), for messages. Maps from ``legs precompute``
             are found by the target's fingerprint, and used only for the very image that they were made from.
-        mask: one value a pixel, zeroes the weight where it is 0. A mask of the store is applied beside it: the loss is
-            the mean over what that counts, and an image that the store does not know is said (docs/masks.md).
+        mask: one value a pixel, bool or floats in [0, 1], zeroes the weight where it is 0. A mask of the store is
+            applied beside it: the loss is the mean over what that counts, and an image that the store does not know is
+            said (docs/masks.md).
         channels_last: where the channel stands, for a shape that does not show it, as [3, 100, 4].
         reduction: "mean", or "none" for the map of weighted errors, in the prediction's shape.
         own: the codebase's own L1 of (prediction, target), where it is more than a mean: its mask or reduction is then
@@ -62,8 +63,9 @@ def l1_loss(
 
     Raises:
         LegsError: shapes that do not fit (both are named), that may be read either way, or that contradict
-            ``channels_last``; the target alone requires a gradient: the two are swapped; ``own`` is no L1; on the
-            CPU a target with NaN or infinity; a setting in legs.toml or LEGS_* that is out of range.
+            ``channels_last``; the target alone requires a gradient: the two are swapped; ``own`` is no L1; a mask of
+            whole numbers; on the CPU a target with NaN or infinity, or a mask beyond [0, 1]; a setting in legs.toml or
+            LEGS_* that is out of range; torch.func or a re-entrant checkpoint together with torch.compile.
 
     Examples:
         >>> target = torch.rand(3, 8, 8)

@@ -114,7 +114,7 @@ def legs_loss(
         torch.Size([3, 16, 16])
     """
     spec = PRESETS[spec] if spec.__class__ is str and spec in PRESETS else as_spec(spec)
-    if not 0.0 <= lambda_dssim <= 1.0:
+    if not (isinstance(lambda_dssim, (int, float, Tensor)) and 0.0 <= lambda_dssim <= 1.0):
         raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
     made_by = None if weight is not None or spec.beta == 0.0 or lambda_dssim == 1.0 else spec
     if made_by is not None and made_by.over == "scene":

@@ -59,7 +59,7 @@ def check_operator(operator: str, p: float) -> None:
     Raises:
         LegsError: one of them is unknown; the message lists what there is.
     """
-    if operator not in OPERATORS:
+    if not isinstance(operator, str) or operator not in OPERATORS:
         names = ", ".join(OPERATORS)
         raise LegsError(f"no operator is named {operator!r}: choose one of {names}" + did_you_mean(operator, OPERATORS))
     if not any(p == norm for norm in NORMS):  # not `in`: torch.compile with dynamic=True would find none

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Mapping, Union
@@ -10,13 +11,15 @@ from legs_loss.curves import curve
 from legs_loss.errors import LegsError, did_you_mean
 from legs_loss.operators import check_operator
 
-# In float32 a larger factor overflows in the sum over an image, and a smaller eps is 0: both give NaN.
-_LARGEST_FACTOR, _LEAST_EPS = 1e6, 1e-30
-
-
-def _check_number(name: str, value: float, fits: bool, range_: str) -> None:
-    if not fits:
-        raise LegsError(f"{name} must be {range_}, got {value!r}")
+# The least and the largest of each number. In float32 a larger factor overflows in the sum over an image, and a smaller
+# eps is 0: both give NaN.
+_RANGES = {
+    "beta": (0.0, 1e6, "at least 0 and at most 1e6"),
+    "percentile": (sys.float_info.min, 100.0, "above 0 and at most 100"),
+    "eps": (1e-30, sys.float_info.max, "at least 1e-30"),
+    "noise_floor": (0.0, 1e6, "at least 0 and at most 1e6"),
+    "smooth": (0.0, 100.0, "in [0, 100]"),
+}
 
 
 @dataclass(frozen=True)
@@ -64,12 +67,10 @@ class WeightSpec:
     def __post_init__(self) -> None:
         check_operator(self.operator, self.p)
         curve(self.curve)
-        for name in ("beta", "noise_floor"):
-            factor = getattr(self, name)
-            _check_number(name, factor, 0.0 <= factor <= _LARGEST_FACTOR, "at least 0 and at most 1e6")
-        _check_number("percentile", self.percentile, 0.0 < self.percentile <= 100.0, "above 0 and at most 100")
-        _check_number("eps", self.eps, _LEAST_EPS <= self.eps < float("inf"), f"at least {_LEAST_EPS:g}")
-        _check_number("smooth", self.smooth, 0.0 <= self.smooth <= 100.0, "in [0, 100]")
+        for name, (least, largest, range_) in _RANGES.items():
+            value = getattr(self, name)
+            if not (hasattr(value, "__float__") and least <= value <= largest):
+                raise LegsError(f"{name} must be {range_}, got {value!r}")
         if self.normalise not in ("none", "mean"):
             raise LegsError(f'normalise must be "none" or "mean", got {self.normalise!r}')
         if self.over not in ("image", "scene"):

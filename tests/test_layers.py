@@ -88,7 +88,7 @@ def test_a_private_name_is_told_from_a_public_one() -> None:
     assert is_public("legs_loss", "l1_loss") and is_public("legs_loss.lab.rasterizer", "draw")
     assert not is_public("legs_loss.runtime", "_Run")
     assert is_public("legs_loss.errors", "require") and not is_public("legs_loss.errors", "difflib")
-    assert not is_public("legs_loss.spec", "_check_number") and not is_public("legs_loss.spec", "curve")
+    assert not is_public("legs_loss.spec", "_RANGES") and not is_public("legs_loss.spec", "curve")
     assert not is_public("legs_loss.lab.rasterizer.sorting", "OWNER")
 
 

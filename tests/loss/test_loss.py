@@ -232,7 +232,7 @@ class TestBadInput:
         with pytest.raises(LegsError, match="uint8"):
             legs_loss(torch.rand(3, 4, 5), torch.zeros(3, 4, 5, dtype=torch.uint8))
 
-    @pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
+    @pytest.mark.parametrize("value", [-0.1, 1.1, float("nan"), "0.2", None])
     def test_lambda_out_of_range(self, value):
         with pytest.raises(LegsError, match="lambda_dssim"):
             legs_loss(torch.rand(3, 4, 5), torch.rand(3, 4, 5), lambda_dssim=value)

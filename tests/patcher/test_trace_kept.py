@@ -160,6 +160,20 @@ LOOP
         leaf.grad = slope
     splats.optimizer.step()
 """,
+    "one L1 function for colour and a grey copy": """
+def l1_loss(output, reference):
+    return torch.abs(output - reference).mean()
+
+
+def brightness(picture):
+    return picture[:1] + picture[1:2] + picture[2:]
+
+
+LOOP
+    loss = l1_loss(drawn["rgb"], gt_image)  # <- here
+    loss = loss + 0.1 * l1_loss(brightness(drawn["rgb"]), brightness(gt_image))
+STEP
+""",
     "a difference that has a name": """
 def masked(drawn, target):
     delta = drawn["rgb"] - target

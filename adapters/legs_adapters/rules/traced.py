@@ -211,7 +211,8 @@ class _Join:
 
     def _other(self, traced: Traced, stack: List[_Candidate]) -> None:
         """Report a term that is not weighted, where no photometric one was decided on its line."""
-        if any(candidate.key in self.settled for candidate in stack):
+        own = [candidate for candidate in stack if not self._is_definition(candidate)] or stack
+        if any(candidate.key in self.settled for candidate in own):
             return
         if not stack:  # that of a photograph is said: it is squared, or compiled
             here = self._line(traced.frames[0])
@@ -220,7 +221,6 @@ class _Join:
                 self.entries.append(Left(*here, traced.text(self._name(traced, [])), (here,)))
                 self.settled.add((here.path, here.line))
             return
-        own = [candidate for candidate in stack if not self._is_definition(candidate)] or stack
         candidate = own[0]
         place, text = candidate.function.place(candidate.form.node), traced.text(self._name(traced, [candidate]))
         is_left = any((entry.path, entry.line) == candidate.key for entry in self.found.left)

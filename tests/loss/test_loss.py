@@ -129,6 +129,11 @@ class TestMask:
             with pytest.raises(LegsError, match=rf"mask has values {says}: give values in \[0, 1\]"):
                 function(prediction, target, mask=torch.full((16, 16), value))
 
+    def test_a_mask_that_was_rounded_is_one(self):
+        prediction, target = torch.rand(3, 4, 5, requires_grad=True), torch.rand(3, 4, 5)
+        rounded = weighted_l1(prediction, target, mask=torch.full((4, 5), 1.0 + 1e-6))
+        torch.testing.assert_close(rounded, (prediction - target).abs().mean())
+
     @pytest.mark.parametrize("value", [-1.0, math.nan, math.inf, 2e6])
     def test_a_weight_that_is_none_is_refused(self, value):
         prediction, target = torch.rand(3, 16, 16, requires_grad=True), torch.rand(3, 16, 16)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Optional, Tuple, Union
@@ -50,9 +51,11 @@ def read_scene(path: Union[str, Path], images: Optional[str] = None) -> Scene:
 
 def _images_folder(root: Path, images: str) -> Tuple[Path, str]:
     """Return the folder of the photographs and the prefix of their names."""
-    there = [folder for folder in (root / images, Path(images)) if folder.is_dir()]  # the scene's first
-    if not there:
-        raise LegsError(f"there is no folder {root / images}: name the scene's images with --images")
-    folder, top = there[0].resolve(), root.resolve()
-    inside = folder.relative_to(top).as_posix() if top in (folder, *folder.parents) else folder.name
-    return there[0], f"{inside}/"
+    folder = root / images  # pathlib keeps an absolute ``images`` as it is
+    if not folder.is_dir():
+        folder = Path(images)
+        if not os.path.isdir(images):  # which raises nothing where the current folder may not be entered
+            raise LegsError(f"there is no folder {root / images}: name the scene's images with --images")
+    found, top = folder.resolve(), root.resolve()
+    inside = found.relative_to(top).as_posix() if top in (found, *found.parents) else found.name
+    return folder, f"{inside}/"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 import signal
@@ -58,6 +59,23 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     root = tmp_path_factory.mktemp("tiny") / "table"
     return write_embedded_scene(root, views=12, width=64, height=48, points=900, samples=2)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Of the processes that share the suite, the first compiles what trains; the others wait, and load it."""
+    if "PYTEST_XDIST_WORKER" not in os.environ or importlib.util.find_spec("numba") is None:
+        return
+    from legs_loss.lab.embedded import write_embedded_scene
+    from legs_loss.system.locks import FileLock
+    from tests.support import legs
+
+    folder = tmp_path_factory.getbasetemp().parent / "compiled"  # one for all processes of this run
+    folder.mkdir(exist_ok=True)
+    with FileLock(folder / "lock"):
+        if not (folder / "run").exists():
+            write_embedded_scene(folder / "scene", views=3, width=32, height=24, points=200, samples=1)
+            legs("train", folder / "scene", "--out", folder / "run", "--iterations", 3)
 
 
 @pytest.fixture(scope="module")

@@ -71,9 +71,8 @@ def _large_trees() -> Iterator[None]:
     try:
         yield
     except RecursionError:
-        raise LegsError(
-            "an expression of thousands of parts is nested too deeply: skip its file with --exclude"
-        ) from None
+        why = "an expression of thousands of parts is nested too deeply: skip its file with --exclude"
+        raise LegsError(why) from None
     finally:
         sys.setrecursionlimit(before)
         if collects:
@@ -176,9 +175,8 @@ def write(plan: Plan, force: bool = False) -> List[str]:
         own = {path: plan.source(path) for path in plan.after if not journal.is_as_written(path, plan.source(path))}
         changed = [] if force else changed_files(root, own)
         if changed:
-            raise LegsError(
-                f"uncommitted changes in what would be patched ({first_of(changed, 5)}): commit them, or use --force"
-            )
+            files = first_of(changed, 5)
+            raise LegsError(f"uncommitted changes in what would be patched ({files}): commit them, or use --force")
         for path, data in plan.after.items():
             journal.add(path, Layer(plan.source(path), plan.edits[path], digest(data)))
         # The journal is written first, so that --undo works whatever happens next.

@@ -73,10 +73,8 @@ def run_script(
         _say(f"not weighted: {elsewhere.text(root)}")
     is_plain = not found.after and not found.findings.patched
     instead = list(trained_instead(root, (), found.findings))
-    said = [
-        f"{problem.path}:{problem.line}: {problem.reason}; if this is the loss: {problem.way}"
-        for problem in (*found.findings.problems, *found.findings.doubts)
-    ]
+    quoted = (*found.findings.problems, *found.findings.doubts)
+    said = [f"{each.path}:{each.line}: {each.reason}; if this is the loss: {each.way}" for each in quoted]
     if is_plain and found.findings.problems:
         raise LegsError(*said, *instead)
     for text in said if is_plain else (*said, *instead):

@@ -39,10 +39,8 @@ def undo(path: str | os.PathLike[str], force: bool = False, look: bool = False) 
     with locked(root, f"legs-patch --undo {path}") as stop:
         journal = Journal.read(root)
         if journal.data is None:
-            raise LegsError(
-                f"{root}: nothing to undo: there is no {JOURNAL}",
-                *(f"{name} is weighted: {why}" for name, why in unrecorded(root)),
-            )
+            bare = [f"{name} is weighted: {why}" for name, why in unrecorded(root)]
+            raise LegsError(f"{root}: nothing to undo: there is no {JOURNAL}", *bare)
         changes, kept = _undone(root, journal, force)
         if not look:
             left = {name: layers for name, layers in journal.files.items() if name in dict(kept)}

@@ -179,10 +179,8 @@ def _of_terms(terms: Sequence[Traced]) -> Dict[str, bool]:
 def _are_close(losses: Sequence[str], others: Sequence[str]) -> bool:
     """Return whether the losses of two trainings agree: the first to rounding, which the later steps carry on."""
     bounds = [FIRST_STEP, *[LATER_STEPS] * len(losses)]
-    return len(losses) == len(others) and all(
-        math.isclose(float.fromhex(one), float.fromhex(other), rel_tol=bound)
-        for one, other, bound in zip(losses, others, bounds)
-    )
+    pairs = zip(map(float.fromhex, losses), map(float.fromhex, others), bounds)
+    return len(losses) == len(others) and all(math.isclose(a, b, rel_tol=bound) for a, b, bound in pairs)
 
 
 def _script(root: Path) -> str:

@@ -54,7 +54,7 @@ def read_ply(path: Union[str, Path]) -> Gaussians:
 
     Raises:
         LegsError: not a binary .ply of Gaussians, the message names the property that is missing; or its size is not
-            what the header says; or a value is NaN.
+            what the header says.
     """
     try:
         data = read_regular(path, _LARGEST)
@@ -84,8 +84,6 @@ def read_ply(path: Union[str, Path]) -> Gaussians:
     columns = np.empty((count, len(needed)), np.float32)
     for i, name in enumerate(needed):
         columns[:, i] = table[name]
-    if np.isnan(columns).any():
-        raise LegsError(f"{path}: {np.isnan(columns).any(1).sum()} Gaussian(s) have values that are NaN")
     parts = torch.from_numpy(columns).split([3, 3, 3 * (coefficients - 1), 1, 3, 4], dim=1)
     means, dc, rests, logits, log_scales, quaternions = (part.contiguous() for part in parts)
     rests = rests.reshape(count, 3, coefficients - 1).transpose(1, 2)

@@ -63,9 +63,7 @@ class Program(Checkout):
     def _resolve(self, function: Function, node: cst.CSTNode, depth: int) -> Iterable[Reference]:
         if isinstance(node, cst.Name):
             found = self.lookup(function, node)
-            return (
-                self._member_of_module(function.module, node.value, depth) if found is None else self._of(*found, depth)
-            )
+            return self._of(*found, depth) if found else self._member_of_module(function.module, node.value, depth)
         if isinstance(node, cst.Attribute):
             return self._attribute(function, node, depth)
         if isinstance(node, cst.Call):

@@ -106,9 +106,8 @@ def _reduced(call: CallReading) -> Optional[Meaning]:
         return None
     meaning = call.ask(of)
     by_axis = "dim" in call.keywords or any(isinstance(constant(axis), int) for axis in axes)
-    return (
-        meaning._replace(kind="feature" if is_grey else "parameter") if meaning.kind == "image" and by_axis else meaning
-    )
+    is_other = meaning.kind == "image" and by_axis
+    return meaning._replace(kind="feature" if is_grey else "parameter") if is_other else meaning
 
 
 def _filtered(call: CallReading) -> Optional[Meaning]:

@@ -1,7 +1,8 @@
-"""Read names: the kind of image, whether it is a rendering or a photograph, whether it is an L1 function."""
+"""Read names: the kind of image, whether it is a rendering or a photograph, an L1 function; and what a file imports."""
 
 from __future__ import annotations
 
+import functools
 import re
 from typing import Optional
 
@@ -19,6 +20,11 @@ from legs_adapters.lexicon.words import (
 TORCH_L1 = re.compile(r"(^|\.)(torch\.nn\.functional|nn\.functional|functional)\.l1_loss$")
 _L1_NAME = re.compile(
     r"^(masked|mask|weighted|pixel|pixelwise|rgb|color|image|photometric)*l1(loss)?(loss|mask(ed)?|rgb|withmask|v\d+)*$"
+)
+
+_TORCH = re.compile(r"^[ \t]*(import|from)[ \t]+torch", re.M)
+_OTHER_FRAMEWORK = re.compile(
+    r"^[ \t]*(import|from)[ \t]+(drjit|flax|jax|jittor|megengine|mindspore|mlx|paddle|tensorflow|tinygrad)\b", re.M
 )
 
 
@@ -50,3 +56,9 @@ def has_perceptual_name(name: str) -> bool:
 def is_l1_name(name: str) -> bool:
     """Return whether a function is an L1, by its name."""
     return _L1_NAME.match(name.replace("_", "").lower()) is not None
+
+
+@functools.lru_cache(maxsize=8)
+def is_of_other_framework(text: str) -> bool:
+    """Return whether a file imports another framework of tensors and no torch."""
+    return _OTHER_FRAMEWORK.search(text) is not None and not _TORCH.search(text)

@@ -75,9 +75,8 @@ OF_PICTURES = word_set("sky sh shs prior time light dx dy")
 FILES = word_set("file filename name path")  # of a picture: where it is, no picture
 BACKGROUND = word_set("bg bkgd background backgrounds")  # a colour to lay things over, whoever keeps it
 PICKING = word_set("mask masks valid bool fg region visible hit keep inside foreground sel robust inliers")
-STATISTICS = word_set(
-    "histc histogram bincount entropy gram moments grayscale gray luminance"
-)  # of a picture, no picture
+# Of a picture, no picture.
+STATISTICS = word_set("histc histogram bincount entropy gram moments grayscale gray luminance")
 PERCEPTUAL = word_set("vgg perceptual lpips gram dists clip dino")
 MESH = word_set("bake baked baking mesh meshhead texture")  # of triangles: what they draw is no splat
 ROBUST = word_set("huber tukey cauchy")  # a weight would move their thresholds

@@ -14,11 +14,10 @@ from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import attribute_chain, call_name, key_of, one_line, same, words, words_in
 from legs_adapters.lexicon.depiction import parts_of
 from legs_adapters.lexicon.meaning import UNKNOWN, swapped
-from legs_adapters.lexicon.names import kind_of_words
+from legs_adapters.lexicon.names import is_of_other_framework, kind_of_words
 from legs_adapters.lexicon.ways import PHOTOGRAPH
 from legs_adapters.lexicon.words import DATA, FILES, MESH, PERCEPTUAL, TRACKING, WARPED
 from legs_adapters.rules.analysis import Analysis
-from legs_adapters.rules.causes.other import is_of_other_framework
 from legs_adapters.rules.order import RULES, first
 from legs_adapters.rules.rule import Term
 from legs_adapters.rules.uses import uses_of

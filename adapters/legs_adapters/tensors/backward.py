@@ -91,9 +91,8 @@ class Training:
         if depth < _DEPTH and any(map(has, function.flow.returns)):
             inner += [(caller, site, set()) for caller, site in sure_calls(self.program, function)]
         owner = self.program.owner_of(function)
-        stored = {
-            each.place for each, value in made if each.place.startswith("self.") and depth < _DEPTH and has(value)
-        }
+        kept = [(each.place, value) for each, value in made if each.place.startswith("self.") and depth < _DEPTH]
+        stored = {place for place, value in kept if has(value)}
         others = owner.methods.values() if owner is not None and stored else ()
         inner += [(method, None, stored) for method in others if method is not function]
         return any(self._is_applied(*each, depth + 1) for each in inner)

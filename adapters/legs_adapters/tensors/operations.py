@@ -50,7 +50,8 @@ OTHER_LOSSES = word_set("huber_loss mse_loss norm smooth_l1_loss")
 MODULES = word_set("F TF einops functional nn np numpy torch")  # as torch and its neighbours are imported
 # Libraries whose operations make no other picture of one, but for the networks in them; and what hands on values.
 OF_IMAGES = re.compile(
-    r"(torch(?!\.hub)|torchvision(?!\.models)|kornia|numpy|PIL|cv2|skimage|scipy|einops|imageio|accelerate|lightning|pytorch_lightning|copy|itertools|random)\b"
+    r"(torch(?!\.hub)|torchvision(?!\.models)|kornia|numpy|PIL|cv2|skimage|scipy|einops|imageio|copy|itertools|random"
+    r"|accelerate|(pytorch_)?lightning)\b"
 )
 LEARNED = re.compile(r"torch\.nn\.(Conv|Linear|Sequential|ModuleList|Embedding|Transformer|Multihead)")  # layers
 MODULE_SELF = word_set("cpu cuda double eval float half requires_grad_ to train")  # a module's methods that return it

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Dict, Iterator, Pattern, Sequence
 
 from legs_adapters.code.folders import first_of, walk
-from legs_adapters.lexicon.names import kind_of_words
+from legs_adapters.lexicon.names import is_of_other_framework, kind_of_words
 from legs_adapters.terms.findings import Findings
 from legs_loss.system.files import read_regular
 
@@ -74,10 +74,9 @@ def _bounded(pattern: str) -> Pattern[str]:
 
 def offered(findings: Findings, command: str = "") -> str:
     """Say how to name the term: by the lines that were skipped, those first that speak of images."""
-    other = re.compile("|".join(pattern for pattern, _ in _INSTEAD[:2]), re.M)  # --site would write torch there
-    texts = {path: source.text for path, source in findings.program.sources.items()}
-    files = [path for path, text in texts.items() if "torch" in text or not other.search(text)]
-    skipped = [left for left in findings.left if left.rule not in ("", "definition") and left.path in files]
+    skipped = [left for left in findings.left if left.rule not in ("", "definition")]
+    # There --site would write torch.
+    skipped = [left for left in skipped if not is_of_other_framework(findings.program.sources[left.path].text)]
     skipped.sort(key=lambda left: "image" not in map(kind_of_words, re.findall(r"\w+", left.text)))
     lines = dict.fromkeys(f"{command}--site {left.path}:{left.line}" for left in skipped)
     if not lines:

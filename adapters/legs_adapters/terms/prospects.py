@@ -156,9 +156,8 @@ def _held(value: str) -> _Words:
     if made is not None and made.group(1) not in HOLDERS:
         name = made.group(1).split(".")[-1]
         is_class = name[:1].isupper()
-        return _Words(
-            frozenset([f"{name}()", *([name] if is_class else [])]), is_class and SPEAKS_OF_L1.search(name) is not None
-        )
+        names = [f"{name}()", name] if is_class else [f"{name}()"]
+        return _Words(frozenset(names), is_class and SPEAKS_OF_L1.search(name) is not None)
     return _NONE if _COMPUTED.match(value) else _Words.of(value)
 
 

@@ -113,16 +113,14 @@ def run_watched(
     spec["limits"] = {"steps" if compared is None else "losses": steps}
     words = [*(command.launcher or [sys.executable]), "-m", "legs_adapters.trace.child", json.dumps(spec)]
     words += [*command.program, *command.arguments]
-    streams: Dict[str, Any] = {"stdout": 2}
+    streams: Dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": 2}
     with contextlib.ExitStack() as after:
         if compared is not None:
             environment.update(_THE_SAME, **compared)
             errors: Any = after.enter_context(tempfile.TemporaryFile())
-            streams = {"stdout": subprocess.DEVNULL, "stderr": errors}
+            streams.update(stdout=subprocess.DEVNULL, stderr=errors)
         after.enter_context(FileLock(f"{report}.lock"))
-        child = subprocess.Popen(
-            words, cwd=str(root), env=environment, stdin=subprocess.DEVNULL, start_new_session=True, **streams
-        )
+        child = subprocess.Popen(words, cwd=str(root), env=environment, start_new_session=True, **streams)
         try:
             code = child.wait(None if compared is None else _SECONDS)
         except subprocess.TimeoutExpired:

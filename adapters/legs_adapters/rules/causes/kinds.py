@@ -60,9 +60,7 @@ KINDS = (
     OtherKind("flow", "flow", "optical flow or motion", 'package["flow"], camera.optical_flow'),
     OtherKind("mask", "mask", "a mask or an opacity map", 'package["alpha"], camera.mask'),
     OtherKind("synthetic", "warp", "a warped, edited or generated image, no photograph", "image, warped_image"),
-    OtherKind(
-        "gradients", "gradient", "an edge map, or a gradient or difference of pictures", "sobel(image), camera.edges"
-    ),
+    OtherKind("gradients", "gradient", "an edge map, gradient or difference of pictures", "sobel(image), camera.edges"),
     OtherKind("parameter", "parameter", "a parameter, of the model or a camera", "model.scales, scales", "regulariser"),
 )
 _NAMES = {rule.kind for rule in KINDS}

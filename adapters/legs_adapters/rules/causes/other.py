@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-import re
 from typing import List
 
+from legs_adapters.lexicon.names import is_of_other_framework
 from legs_adapters.lexicon.words import RAYS, SPLATS
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import of_rays
-
-_TORCH = re.compile(r"^[ \t]*(import|from)[ \t]+torch", re.M)
-_OTHER_FRAMEWORK = re.compile(
-    r"^[ \t]*(import|from)[ \t]+(drjit|flax|jax|jittor|megengine|mindspore|mlx|paddle|tensorflow|tinygrad)\b", re.M
-)
 
 
 class NotSplats(Rule):
@@ -38,9 +32,3 @@ class NotSplats(Rule):
     def may_be_loss(self, term: Term) -> bool:
         sources = term.analysis.program.sources.values()
         return RAYS.search(term.function.module.text) is None and any(SPLATS.search(each.text) for each in sources)
-
-
-@functools.lru_cache(maxsize=8)
-def is_of_other_framework(text: str) -> bool:
-    """Return whether a file imports another framework of tensors and no torch."""
-    return _OTHER_FRAMEWORK.search(text) is not None and not _TORCH.search(text)

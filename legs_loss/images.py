@@ -68,22 +68,22 @@ class Layout(NamedTuple):
             raise LegsError(f"{name} is on {values.device} and the images on {image.device}")
         if name == "mask" and values.dtype is not torch.bool and not values.is_floating_point():
             raise LegsError(f"mask is of type {values.dtype}: give bool, or floats in [0, 1] (8-bit: mask / 255.0)")
-        if values.device.type == "cpu" and not (is_compiling() or is_transformed()):
-            low, high = values.min().item(), values.max().item()
-            most = 1.0 if name == "mask" else _LARGEST_WEIGHT
-            if not (low > -1e-3 and high < most + 1e-3):  # a mask that was resized is rounded
-                raise LegsError(f"{name} has values from {low:g} to {high:g}: give values in [0, {most:g}]")
         batch = list(self.shape[:-3])
         height, width = self.shape[-3:-1] if self.channels_last else self.shape[-2:]
         one, none = ([height, width, 1] if self.channels_last else [1, height, width]), [height, width]
-        shape = list(values.shape)
-        if batch and shape in (batch + one, batch + none):
-            return values.reshape(-1, 1, height, width)
-        if shape in (one, none):
-            return values.reshape(1, height, width)
-        raise LegsError(
-            f"{name} {shape} does not fit images {list(self.shape)}: expected {batch + one} or {batch + none}"
-        )
+        shape, of_all = list(values.shape), (one, none)
+        if shape not in of_all and not (batch and shape in (batch + one, batch + none)):
+            raise LegsError(
+                f"{name} {shape} does not fit images {list(self.shape)}: expected {batch + one} or {batch + none}"
+            )
+        if values.device.type == "cpu" and values.dtype is not torch.bool and not (is_compiling() or is_transformed()):
+            # By numpy: torch's threads would wait on the cores that the loss needs next.
+            found = values.detach().resolve_neg().float().numpy()
+            low, high = found.min(), found.max()
+            most = 1.0 if name == "mask" else _LARGEST_WEIGHT
+            if not (low > -1e-3 and high < most + 1e-3):  # a mask that was resized is rounded
+                raise LegsError(f"{name} has values from {low:g} to {high:g}: give values in [0, {most:g}]")
+        return values.reshape((1, height, width) if shape in of_all else (-1, 1, height, width))
 
 
 def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str = "image") -> Layout:

@@ -30,10 +30,9 @@ HELP = "add the LEGS loss to a codebase, or remove it; the same as legs-patch"
 
 SETTINGS = ("preset", "beta", "curve", "operator", "store")
 EXIT_CODES = (
-    "exit codes: 0 done, or nothing to do; 1 --check: something would change, or a term needs a manual "
-    "edit, or --verify: a check failed; "
-    "2 nothing was changed: bad usage, no term that can be decided (--strict: one that cannot), uncommitted changes; "
-    "130 interrupted"
+    "exit codes: 0 done, or nothing to do; 1 --check: something would change, or a term needs a manual edit, or "
+    "--verify: a check failed; 2 nothing was changed: bad usage, no term that can be decided (--strict: one that "
+    "cannot), uncommitted changes; 130 interrupted"
 )
 
 

@@ -54,10 +54,8 @@ def _changed(root: Path, folder: Path, files: Mapping[str, bytes]) -> List[str]:
             timeout=_SECONDS, env={**os.environ, **_ENVIRONMENT},
         ).stdout  # fmt: skip
     except subprocess.TimeoutExpired:
-        raise LegsError(
-            f"git did not list the last commit of {folder} within {_SECONDS} seconds; nothing was written: "
-            "--force skips this check"
-        ) from None
+        why = f"git did not list the last commit of {folder} within {_SECONDS} seconds"
+        raise LegsError(f"{why}; nothing was written: --force skips this check") from None
     except OSError:
         return []
     entries = [entry.partition("\t") for entry in listed.decode("utf-8", "surrogateescape").split("\0")]

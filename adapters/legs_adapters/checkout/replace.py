@@ -88,9 +88,8 @@ def replace_files(root: Path, changes: Changes, stop: Callable[[], None] = lambd
         try:
             (root / _STAGING).mkdir(mode=0o700)
         except FileExistsError:  # what is one's own is swept
-            raise LegsError(
-                f"{root / _STAGING} is what another user's killed legs-patch left: they can delete it"
-            ) from None
+            why = "is what another user's killed legs-patch left: they can delete it"
+            raise LegsError(f"{root / _STAGING} {why}") from None
         for path, (_, data) in changes.items():
             stop()
             if data is not None:

@@ -172,14 +172,15 @@ class Module:
         self.budget: Budget = budget or Budget()
         self.text = text
         self.lines: Lines = Lines(text.encode("utf-8"))
-        self.outline, cuts = outline_part(self.lines)
+        parts = outline_part(self.lines)
+        self.outline: Part = parts[0]
         self.outline_text: str = STUB.sub("0", self.outline.text.decode("utf-8"))
         self.failure: Optional[Unreadable] = None
         self.spend(parsing_steps(self.outline_text))
         self.by_node: Dict[int, Function | Class] = {}
         self.top: Function = Function(self, self.outline.tree)
         self._by_word: Optional[Dict[str, List[Function]]] = None
-        self._cuts: Iterator[Optional[slice]] = iter(cuts)
+        self._cuts: Iterator[Optional[slice]] = iter(parts[1])
         self._functions = self.collect(self.outline.tree, self.top)
 
     def collect(self, body: cst.CSTNode, parent: Function, owner: Optional[Class] = None) -> List[Function]:

@@ -6,7 +6,7 @@ torch's operations do, then what a name says, then what the arguments are, then 
 
 from __future__ import annotations
 
-from typing import Callable, List, Optional
+from typing import Callable, Dict, List, Optional
 
 import libcst as cst
 
@@ -63,7 +63,8 @@ class CallReading:
         self.node = node
         self.meaning_of = meaning_of
         self.name: str = call_name(node)
-        self.positional, self.keywords, _ = arguments(node)
+        self.positional: List[cst.BaseExpression] = arguments(node)[0]
+        self.keywords: Dict[str, cst.BaseExpression] = arguments(node)[1]
         self.values: List[cst.BaseExpression] = [*self.positional, *self.keywords.values()]
         base = node.func.value if isinstance(node.func, cst.Attribute) else None
         self.owner: Optional[cst.BaseExpression] = None if self._is_module(base) else base

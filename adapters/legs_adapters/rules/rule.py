@@ -44,8 +44,10 @@ class Term:
         self.form = form
         self.here: List[Decider] = [(function, form.node)]
         self.pair: Pair = pair_of(analysis.meanings, analysis.ways, function, form)
-        sides = self.pair.first, self.pair.second
-        self.target, self.prediction = sides if swapped(self.pair.a, self.pair.b) else sides[::-1]
+        first, second = self.pair.first, self.pair.second
+        is_swapped = swapped(self.pair.a, self.pair.b)
+        self.target: cst.BaseExpression = first if is_swapped else second
+        self.prediction: cst.BaseExpression = second if is_swapped else first
 
     @property
     def sides(self) -> Sequence[cst.BaseExpression]:

@@ -129,7 +129,7 @@ class TestFusedLoss:
             "        before = ran()\n"
             "        [loss() for loss in losses * 10]\n"
             "        seen.append(sum(time > before.get(name, 0) for name, time in ran().items()))\n"
-            "    print(max(seen[1:]) if threads == 2 else min(seen[1:]))\n"
+            "    print(sorted(seen[1:])[-2 if threads == 2 else 0])\n"  # in one round another may run, as of torch
         )
         environment = dict(legs_environment(), NUMBA_NUM_THREADS="2", OMP_NUM_THREADS="2", LEGS_BACKEND="numba")
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)

@@ -73,9 +73,8 @@ class Layout(NamedTuple):
         one, none = ([height, width, 1] if self.channels_last else [1, height, width]), [height, width]
         shape, of_all = list(values.shape), (one, none)
         if shape not in of_all and not (batch and shape in (batch + one, batch + none)):
-            raise LegsError(
-                f"{name} {shape} does not fit images {list(self.shape)}: expected {batch + one} or {batch + none}"
-            )
+            wanted = f"{batch + one} or {batch + none}"
+            raise LegsError(f"{name} {shape} does not fit images {list(self.shape)}: expected {wanted}")
         if values.device.type == "cpu" and values.dtype is not torch.bool and not (is_compiling() or is_transformed()):
             # By numpy: torch's threads would wait on the cores that the loss needs next.
             found = values.detach().resolve_neg().float().numpy()
@@ -170,10 +169,8 @@ def check_values(image: Tensor, name: str = "target") -> None:
     """
     largest = float(image.detach().abs().amax())
     if largest != largest or largest == float("inf"):
-        raise LegsError(
-            f"{name} {shape_of(image)} has values that are NaN or infinite: "
-            "a weight map cannot be made from it; look at how this view is loaded"
-        )
+        why = "a weight map cannot be made from it; look at how this view is loaded"
+        raise LegsError(f"{name} {shape_of(image)} has values that are NaN or infinite: {why}")
     if largest > _SURELY_NOT_UNIT_RANGE:
         raise LegsError(
             f"{name} {shape_of(image)} has values up to {largest:g}: images are in [0, 1] here "

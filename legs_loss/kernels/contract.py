@@ -148,6 +148,10 @@ class _FusedLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor, map_: Any, range_: Any, prepared: PreparedLoss) -> Tensor:
+        channels, height, width = prediction.shape[-3:]
+        # Kernels read a map by its address: for all views, or for each.
+        if map_ is not None and map_.numel() not in (height * width, prediction.numel() // channels):
+            raise LegsError(f"weight {list(map_.shape)} does not fit images {list(prediction.shape)}")
         try:
             loss, gradient = prepared.compute(prediction, target, map_, range_)
         except Exception as error:

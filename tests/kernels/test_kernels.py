@@ -18,11 +18,13 @@ from hypothesis import strategies as st
 from legs_loss import LegsError, LEGSLoss, WeightSpec, l1_loss, legs_loss, ssim, weight_map
 from legs_loss.curves import FORMULAS
 from legs_loss.kernels.available import BACKENDS
+from legs_loss.kernels.contract import L1, SSIM, terms_of
 from legs_loss.operators import OPERATORS, Operator
 from legs_loss.precompute import normalised_map
 from legs_loss.responses import response
 from legs_loss.scenes.images import image_tensor
 from legs_loss.spec import PRESETS
+from legs_loss.weights import Weights
 from tests.kernels.support import by_signature, compare, images, used
 from tests.preloaded import run
 from tests.support import legs_environment
@@ -52,6 +54,13 @@ class TestFusedLoss:
             target,
             {"none": None, "map": weight_map(target, channels_last=False), "spec": PRESETS["legs"]}[weight],
         )
+
+    @pytest.mark.parametrize("terms", [L1, SSIM, terms_of(0.2)])
+    def test_a_map_of_another_size_is_never_read(self, terms):
+        prediction, target = images((2, 3, 30, 17))
+        for size in ((1, 4, 4), (3, 1, 30, 17), (1, 30, 18)):
+            with pytest.raises(LegsError, match=r"does not fit images \[2, 3, 30, 17\]"):
+                numba_loss.BACKEND.loss(terms, prediction.requires_grad_(), target, Weights(map=torch.ones(size)))
 
     @pytest.mark.parametrize("operator", COMPILED)
     @pytest.mark.parametrize("p", [1.0, 2.0, float("inf")])

@@ -23,6 +23,7 @@ from legs_loss.system.ctrl_c import held_back
 
 STUB = re.compile("0#x*")  # what stands for a body
 
+_CHECK = cst.CSTNode.__post_init__  # of a new node, a tenth of LibCST's time: what its parser makes needs none
 _FORM_FEED = re.compile(rb"^[ \t\f]*\f[ \t\f]*(?=\r?$)", re.M)  # LibCST loses these lines: comments, to it
 _NEWLINE = re.compile(rb"\r\n|\r|\n")
 _LONE_RETURN = re.compile(rb"\r(?!\n)")
@@ -97,7 +98,11 @@ class Part:
 
     def __init__(self, lines: Lines, text: bytes, shift: int = 0) -> None:
         self.text: bytes = _FORM_FEED.sub(lambda found: b"#" * len(found.group()), text)
-        self.tree: cst.Module = cst.parse_module(self.text.decode("utf-8"))
+        cst.CSTNode.__post_init__ = lambda self: None  # type: ignore[method-assign]
+        try:
+            self.tree: cst.Module = cst.parse_module(self.text.decode("utf-8"))
+        finally:
+            cst.CSTNode.__post_init__ = _CHECK  # type: ignore[method-assign]
         self._lines = lines
         self._writing = _TokenCount(self.tree.default_indent, self.tree.default_newline)
         self._starts: List[int] = [shift]  # the byte at which each token starts, and the end

@@ -109,13 +109,13 @@ class Purposes:
         own = next((call for call in passes if function.place(call).end > at), passes[0])
         may_train = self._may_train(function, own, 0, False)
         inner: List[cst.Call] = []  # the backward passes of the innermost loop that has one
-        for scope in [*function.flow.loops_around(node), function.body]:
-            inside = {id(part) for part in walk_expressions(scope)}
-            within = [call for call in passes if id(call) in inside]
+        for loop in [*function.flow.loops_around(node), None]:
+            calls = [call for call in function.flow.calls if loop is None or loop in function.flow.loops_around(call)]
+            within = [call for call in calls if is_backward(call)]
             if inner and len(within) > len(inner) and not may_train:
                 break  # the step is of the other backward pass
             inner = inner or within
-            calls = [call for call in function.flow.calls if id(call) in inside] if within else []
+            calls = calls if within else []
             steps = [step for call in calls for step in self._steps(function, call)]
             if steps:
                 return None, steps

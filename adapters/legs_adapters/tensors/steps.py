@@ -41,7 +41,7 @@ def has_step(function: Function) -> bool:
 @functools.lru_cache(maxsize=64)  # a term asks about what is called after it, and the next term again
 def reads_gradients(function: Function) -> bool:
     """Return whether a function reads gradients, ``xyz.grad``; not where they are only compared, assigned or reset."""
-    parts = list(walk_expressions(function.body)) if "grad" in function.text else []
+    parts = list(walk_expressions(function.body)) if ".grad" in function.text else []
     others = [part for part in parts if isinstance(part, (cst.Comparison, cst.AssignTarget))]
     unread = {id(each) for part in others for each in walk_expressions(part)}
     return any(isinstance(p, cst.Attribute) and p.attr.value == "grad" and id(p) not in unread for p in parts)

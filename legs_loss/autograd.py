@@ -19,6 +19,9 @@ def _never(*_: object) -> bool:
 # Whether torch.compile is tracing: checks that read values from the device are skipped then.
 is_compiling: Callable[[], bool] = getattr(getattr(torch, "compiler", None), "is_compiling", _never)
 
+# The backward pass that this runs in, as the second pass of a checkpoint does; -1 in none.
+backward_pass: Callable[[], int] = getattr(torch._C, "_current_graph_task_id", lambda: -1)
+
 _functorch: Any = getattr(torch._C, "_functorch", None)  # of torch.func; torch 1.12 has none
 is_wrapped: Callable[[Tensor], bool] = getattr(_functorch, "is_functorch_wrapped_tensor", _never)  # by torch.func
 _levels: Any = getattr(_functorch, "peek_interpreter_stack", None)
@@ -35,16 +38,24 @@ def is_differentiated() -> bool:
     return forward_ad._current_level >= 0 or (_levels is not None and _levels() is not None)
 
 
+_OF_NODES = ("forward", "apply", "call_function")  # of a Function, of all Functions, of one that torch.compile traces
+_SETUP = getattr(torch.autograd.Function, "setup_context", None)
+
+
 def is_in_a_node() -> bool:
-    """Return whether this runs in the forward pass of an autograd.Function that becomes a node of a graph."""
+    """Return whether this runs, or is compiled, in the forward pass of an autograd.Function that becomes a node."""
     frame = None if torch.is_grad_enabled() else sys._getframe(1)
     while frame is not None:
         code = frame.f_code
-        if code.co_name == "forward" and code.co_argcount:
-            context = frame.f_locals.get(code.co_varnames[0])
-            # It has none where the graph does not get this node.
-            if isinstance(context, torch.autograd.function.FunctionCtx) and getattr(context, "next_functions", None):
+        if code.co_name in _OF_NODES and code.co_argcount:
+            first = frame.f_locals.get(code.co_varnames[0])
+            # A context has no next functions where the graph does not get this node.
+            if isinstance(first, torch.autograd.function.FunctionCtx) and getattr(first, "next_functions", None):
                 return True
+            if type(first).__name__ == "AutogradFunctionApplyVariable":
+                return True
+            if getattr(first, "setup_context", _SETUP) is not _SETUP:  # its forward has no context
+                return any(isinstance(one, Tensor) and one.requires_grad for one in frame.f_locals["args"])
         frame = frame.f_back
     return False
 

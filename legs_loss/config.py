@@ -112,9 +112,7 @@ def _apply(config: Config, settings: Dict[str, Any], where: str, base: Path) -> 
             if key not in _SETTINGS:
                 raise LegsError(f"unknown setting {key!r}; there are {', '.join(_SETTINGS)}{_meant(key, _SETTINGS)}")
         preset = settings.pop("preset", None)
-        if preset is not None and not isinstance(preset, str):
-            raise LegsError(f"preset must be a text, got {repr(preset)[:100]}")
-        store = _store(settings.pop("store", None), base)
+        store = store_folder(settings.pop("store", None), base)
         spec = config.spec if preset is None else as_spec(preset)
         spec = replace(spec, **{key: _typed(key, value) for key, value in settings.items()})
     except LegsError as error:
@@ -129,24 +127,22 @@ def _apply(config: Config, settings: Dict[str, Any], where: str, base: Path) -> 
 
 
 def _typed(key: str, value: Any) -> Any:
-    if key in _TEXT_FIELDS:
-        if not isinstance(value, str):
-            raise LegsError(f"{key} must be a text, got {repr(value)[:100]}")
-        return value
-    try:
-        if isinstance(value, bool):
-            raise TypeError
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        raise LegsError(f"{key} must be a number, got {repr(value)[:100]}") from None
+    """Return a setting's value as WeightSpec takes it, which says what is wrong with any other."""
+    with suppress(TypeError, ValueError, OverflowError):
+        return value if key in _TEXT_FIELDS or isinstance(value, bool) else float(value)
+    return value
 
 
-def _store(value: Any, base: Path) -> Optional[Path]:
-    """Return the folder that a setting names, relative to another folder; None without one."""
+def store_folder(value: Any, base: Path) -> Optional[Path]:
+    """Return the folder that a setting names, relative to another folder; None without one.
+
+    Raises:
+        LegsError: it is no path.
+    """
+    if not isinstance(value, (str, Path, type(None))) or "\0" in str(value):
+        raise LegsError(f"store must be a path, got {repr(value)[:100]}")
     if value is None or value == "":
         return None
-    if not isinstance(value, str) or "\0" in value:
-        raise LegsError(f"store must be a path, got {repr(value)[:100]}")
     try:
         return base / Path(value).expanduser()
     except RuntimeError:

@@ -78,12 +78,14 @@ def register_curve(name: str, function: Curve) -> None:
         raise LegsError(f"a curve's name is a non-empty string, got {name!r}")
     if name in _CURVES:
         raise LegsError(f"a curve named {name!r} exists already: choose another name")
+    if not callable(function):
+        raise LegsError(f"curve {name!r} must be a function, got {function!r}")
     import torch
 
     x = torch.linspace(0.0, 1.0, 257)
     y = function(x.clone())
-    if not isinstance(y, torch.Tensor) or y.shape != x.shape:
-        raise LegsError(f"curve {name!r} must return a tensor of its input's shape")
+    if not isinstance(y, torch.Tensor) or y.shape != x.shape or y.is_complex():
+        raise LegsError(f"curve {name!r} must return a real tensor of its input's shape")
     if not bool(((y >= 0.0) & (y <= 1.0)).all()):
         raise LegsError(
             f"curve {name!r} must map [0, 1] into [0, 1]: its values run from {float(y.min()):g} to {float(y.max()):g}"

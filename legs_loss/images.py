@@ -62,8 +62,7 @@ class Layout(NamedTuple):
         """
         if values is None:
             return None
-        if not isinstance(values, Tensor):
-            raise LegsError(f"{name} must be a torch.Tensor, got {type(values).__name__}")
+        _check_tensor(values, name)
         if values.device != image.device:
             raise LegsError(f"{name} is on {values.device} and the images on {image.device}")
         if name == "mask" and values.dtype is not torch.bool and not values.is_floating_point():
@@ -85,6 +84,13 @@ class Layout(NamedTuple):
         return values.reshape((1, height, width) if shape in of_all else (-1, 1, height, width))
 
 
+def _check_tensor(values: object, name: str) -> None:
+    if not isinstance(values, Tensor):
+        raise LegsError(f"{name} must be a torch.Tensor, got {type(values).__name__}")
+    if values.layout is not torch.strided:
+        raise LegsError(f"{name} is sparse: give {name}.to_dense()")
+
+
 def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str = "image") -> Layout:
     """Return the layout of an image, as its shape shows it.
 
@@ -102,8 +108,9 @@ def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str =
         >>> read_layout(torch.zeros(1, 6, 8, 3)).channels_last
         True
     """
-    if not isinstance(image, Tensor):
-        raise LegsError(f"{name} must be a torch.Tensor, got {type(image).__name__}")
+    _check_tensor(image, name)
+    if not isinstance(channels_last, (bool, type(None))):
+        raise LegsError(f"channels_last must be True, False or None, got {channels_last!r}")
     if not image.is_floating_point():
         raise LegsError(f"{name} is of type {image.dtype}: give floats in [0, 1] (8-bit images: image / 255.0)")
     if image.dim() == 0 or image.numel() == 0:

@@ -7,14 +7,14 @@ from typing import Optional
 import torch
 from torch import Tensor
 
-from legs_loss.autograd import check_order, is_compiling, is_trained
+from legs_loss.autograd import backward_pass, check_order, is_compiling, is_trained
 from legs_loss.counting import counted, note_graph, said, say_first
 from legs_loss.errors import LegsError
 from legs_loss.images import read_pair
 from legs_loss.kernels.backends import LossPlan, fused, plan_of
 from legs_loss.kernels.contract import Terms, terms_of
 from legs_loss.responses import NEEDS_LEVELS
-from legs_loss.similarity import WINDOW_SIZE, d_ssim
+from legs_loss.similarity import WINDOW_SIZE, check_window, d_ssim
 from legs_loss.spec import PRESETS, Spec, as_spec
 from legs_loss.weights import Weights
 
@@ -114,12 +114,11 @@ def legs_loss(
         torch.Size([3, 16, 16])
     """
     spec = PRESETS[spec] if spec.__class__ is str and spec in PRESETS else as_spec(spec)
-    if not (isinstance(lambda_dssim, (int, float, Tensor)) and 0.0 <= lambda_dssim <= 1.0):
-        raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
+    terms = whole(lambda_dssim, padding)
     made_by = None if weight is not None or spec.beta == 0.0 or lambda_dssim == 1.0 else spec
     if made_by is not None and made_by.over == "scene":
         raise LegsError(NEEDS_LEVELS.format(where="one call does not know", then="and give LEGSLoss that store="))
-    plan, image, photograph = plan_of(whole(lambda_dssim, padding), made_by, prediction, target, channels_last)
+    plan, image, photograph = plan_of(terms, made_by, prediction, target, channels_last)
     if made_by is not None and not (prediction.requires_grad and torch.is_grad_enabled()):
         check_order(prediction, target)
     weights, made = Weights(made_by), "" if made_by is None else "by legs_loss"
@@ -131,7 +130,16 @@ def legs_loss(
 
 
 def whole(lambda_dssim: float, padding: str) -> Optional[Terms]:
-    """Return the terms of a plan of :func:`total_loss`; None where it is torch's."""
+    """Return the terms of a plan of :func:`total_loss`; None where it is torch's.
+
+    Raises:
+        LegsError: the share is no number in [0, 1], or no padding has that name.
+    """
+    is_number = isinstance(lambda_dssim, (int, float)) or (isinstance(lambda_dssim, Tensor) and lambda_dssim.dim() == 0)
+    if not (is_number and 0.0 <= lambda_dssim <= 1.0):
+        raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
+    if padding != "zeros":
+        check_window(WINDOW_SIZE, padding)
     by_torch = padding != "zeros" or lambda_dssim == 0.0 or is_compiling()
     return None if by_torch else terms_of(float(lambda_dssim))  # a tensor's hash is its place
 
@@ -159,14 +167,15 @@ def total_loss(
 
 
 def _note(prediction: Tensor, target: Tensor, weights: Weights, made: str) -> None:
-    if not (torch.is_grad_enabled() and (prediction.requires_grad or is_trained(prediction) or is_trained(target))):
+    if not ((prediction.requires_grad and torch.is_grad_enabled()) or is_trained(prediction) or is_trained(target)):
         return
     if is_compiling():
         if made:
             note_graph()
         return
-    counted.weighted += made != ""
-    counted.plain_steps += made == ""
+    first = backward_pass() == -1  # a checkpoint computes its loss again in the backward
+    counted.weighted += first and made != ""
+    counted.plain_steps += first and made == ""
     if not said:
         spec = weights.spec
         made = made if spec is None else f"{spec.operator}, {spec.curve}, beta {spec.beta:g}, {made}"

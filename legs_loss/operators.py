@@ -62,5 +62,6 @@ def check_operator(operator: str, p: float) -> None:
     if not isinstance(operator, str) or operator not in OPERATORS:
         names = ", ".join(OPERATORS)
         raise LegsError(f"no operator is named {operator!r}: choose one of {names}" + did_you_mean(operator, OPERATORS))
-    if not any(p == norm for norm in NORMS):  # not `in`: torch.compile with dynamic=True would find none
+    # Not `in`: torch.compile with dynamic=True would find none.
+    if not isinstance(p, (int, float)) or isinstance(p, bool) or not any(p == norm for norm in NORMS):
         raise LegsError(f"p must be 1, 2 or inf, got {p!r}")

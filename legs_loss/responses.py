@@ -29,7 +29,7 @@ from torch import Tensor
 from legs_loss.autograd import is_compiling
 from legs_loss.images import read_layout
 from legs_loss.operators import OPERATORS, Operator, Stencil, check_operator
-from legs_loss.spec import WeightSpec
+from legs_loss.spec import WeightSpec, check_number
 
 NEEDS_LEVELS = (
     "weights that are normalised over the scene need the levels of all its views, which {where}: run legs precompute "
@@ -72,6 +72,7 @@ def response(
     """
     layout = read_layout(image, channels_last)
     check_operator(operator, p)
+    check_number("smooth", smooth)
     flat = layout.channels_first(image.detach())
     flat = flat.to(torch.promote_types(flat.dtype, torch.float32))
     if smooth > 0.0:

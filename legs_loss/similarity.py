@@ -17,6 +17,7 @@ WINDOW_SIZE = 11
 SIGMA = 1.5
 LUMINANCE_CONSTANT = 0.01**2  # the C1 and C2 of Wang et al., where a curve has these names
 CONTRAST_CONSTANT = 0.03**2
+_PADDINGS = ("zeros", "reflect", "replicate", "valid")
 
 
 def ssim_map(
@@ -30,8 +31,7 @@ def ssim_map(
 
     Padding "valid" leaves out the pixels whose window is not inside the image.
     """
-    if not isinstance(window_size, int) or window_size < 1 or window_size % 2 == 0:
-        raise LegsError(f"window_size must be an odd number of pixels, got {window_size!r}")
+    check_window(window_size, padding)
     _, first, second = read_pair(prediction, target, channels_last)
     dtype = torch.promote_types(torch.promote_types(first.dtype, second.dtype), torch.float32)
     device = first.device.type if first.device.type in ("cpu", "cuda") else "cpu"
@@ -50,6 +50,18 @@ def ssim_map(
         covariance = blur(first * second) - mean12
         scale = (mean1_sq + mean2_sq + LUMINANCE_CONSTANT) * (variance1 + variance2 + CONTRAST_CONSTANT)
         return ((2 * mean12 + LUMINANCE_CONSTANT) * (2 * covariance + CONTRAST_CONSTANT)) / scale
+
+
+def check_window(window_size: int, padding: str) -> None:
+    """Check the settings of a window.
+
+    Raises:
+        LegsError: its size is no odd number, or no padding has that name.
+    """
+    if not isinstance(window_size, int) or window_size < 1 or window_size % 2 == 0:
+        raise LegsError(f"window_size must be an odd number of pixels, got {window_size!r}")
+    if not (isinstance(padding, str) and padding in _PADDINGS):
+        raise LegsError(f"no padding is named {padding!r}: choose {', '.join(_PADDINGS)}")
 
 
 def d_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_last: Optional[bool] = None) -> Tensor:
@@ -91,8 +103,6 @@ def _padded(first: Tensor, second: Tensor, padding: str, window_size: int) -> Tu
         return first, second, margin
     height, width = first.shape[-2:]
     smallest = {"reflect": margin + 1, "replicate": 1, "valid": window_size}
-    if padding not in smallest:
-        raise LegsError(f"no padding is named {padding!r}: choose zeros, {', '.join(smallest)}")
     if min(height, width) < smallest[padding]:
         raise LegsError(
             f'padding "{padding}" needs images of at least {smallest[padding]} pixels a side, got {shape_of(first)}'

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from numbers import Real
 from types import MappingProxyType
-from typing import Mapping, Union
+from typing import Any, Dict, Mapping, Tuple, Union
 
 from legs_loss.curves import curve
 from legs_loss.errors import LegsError, did_you_mean
@@ -13,13 +14,26 @@ from legs_loss.operators import check_operator
 
 # The least and the largest of each number. In float32 a larger factor overflows in the sum over an image, and a smaller
 # eps is 0: both give NaN.
-_RANGES = {
+_RANGES: Dict[str, Tuple[Any, Any, str]] = {
     "beta": (0.0, 1e6, "at least 0 and at most 1e6"),
     "percentile": (sys.float_info.min, 100.0, "above 0 and at most 100"),
     "eps": (1e-30, sys.float_info.max, "at least 1e-30"),
     "noise_floor": (0.0, 1e6, "at least 0 and at most 1e6"),
     "smooth": (0.0, 100.0, "in [0, 100]"),
 }
+
+
+def check_number(name: str, value: Any) -> None:
+    """Check a number of a spec, by the name of its setting.
+
+    Raises:
+        LegsError: it is no number, or out of range.
+    """
+    least, largest, range_ = _RANGES[name]
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise LegsError(f"{name} must be a number, got {repr(value)[:100]}")
+    if not least <= value <= largest:
+        raise LegsError(f"{name} must be {range_}, got {value!r}")
 
 
 @dataclass(frozen=True)
@@ -67,14 +81,12 @@ class WeightSpec:
     def __post_init__(self) -> None:
         check_operator(self.operator, self.p)
         curve(self.curve)
-        for name, (least, largest, range_) in _RANGES.items():
+        for name in _RANGES:
+            check_number(name, getattr(self, name))
+        for name, words in (("normalise", ("none", "mean")), ("over", ("image", "scene"))):
             value = getattr(self, name)
-            if not (hasattr(value, "__float__") and least <= value <= largest):
-                raise LegsError(f"{name} must be {range_}, got {value!r}")
-        if self.normalise not in ("none", "mean"):
-            raise LegsError(f'normalise must be "none" or "mean", got {self.normalise!r}')
-        if self.over not in ("image", "scene"):
-            raise LegsError(f'over must be "image" or "scene", got {self.over!r}')
+            if not (isinstance(value, str) and value in words):
+                raise LegsError(f'{name} must be "{words[0]}" or "{words[1]}", got {value!r}')
         if self.over == "image" and self.noise_floor > 0.0:
             raise LegsError('noise_floor goes with over="scene": a single image cannot separate noise from texture')
 

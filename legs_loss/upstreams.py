@@ -54,11 +54,11 @@ def apply_to(library: str) -> Applied:
         ...
         legs_loss.errors.LegsError: unknown library 'no_such_library'; known are ...
     """
+    known = plugins("legs_loss.upstreams")
+    if not isinstance(library, str) or library not in known:
+        raise LegsError(f"unknown library {library!r}; known are {', '.join(sorted(known)) or 'none'}")
     if library in _applied:
         return _applied[library]
-    known = plugins("legs_loss.upstreams")
-    if library not in known:
-        raise LegsError(f"unknown library {library!r}; known are {', '.join(sorted(known)) or 'none'}")
     applied = Applied()
     try:
         known[library]()(applied)

@@ -55,6 +55,8 @@ def weight_map(
                 [ 1.0000,  1.0000,  6.0000,  1.0000,  1.0000]])
     """
     spec = as_spec(spec)
+    if scene is not None and not (isinstance(scene, Tensor) and scene.shape == (2,)):
+        raise LegsError(f"scene must be a tensor of two levels, as of scene_levels, got {scene!r}")
     layout = read_layout(image, channels_last)
     if image.device.type == "cpu" and not (is_compiling() or is_transformed()):
         check_values(image, "image")

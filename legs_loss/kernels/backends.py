@@ -19,6 +19,7 @@ from legs_loss.spec import WeightSpec
 from legs_loss.weights import Weights
 
 _PLAIN = {Tensor, torch.nn.Parameter}  # what others mean by their values only they know
+_FLAGS = {bool, type(None)}
 _MOST = 256  # plans; a codebase with more shapes of images begins again
 
 
@@ -68,6 +69,7 @@ def plan_of(
         terms is None
         or type(prediction) not in _PLAIN
         or type(target) not in _PLAIN
+        or type(channels_last) not in _FLAGS
         or is_transformed()
         or is_wrapped(prediction)
         or is_wrapped(target)

@@ -11,7 +11,7 @@ from typing import Any, Callable, Optional, TypeVar
 import torch
 from torch import Tensor
 
-from legs_loss.autograd import check_order, is_compiling, is_trained
+from legs_loss.autograd import backward_pass, check_order, is_compiling, is_trained
 from legs_loss.counting import counted
 from legs_loss.errors import LegsError
 from legs_loss.images import read_pair
@@ -65,7 +65,8 @@ def l1_loss(
         LegsError: shapes that do not fit (both are named), that may be read either way, or that contradict
             ``channels_last``; the target alone requires a gradient: the two are swapped; ``own`` is no L1; a mask of
             whole numbers; on the CPU a target with NaN or infinity, or a mask beyond [0, 1]; a setting in legs.toml or
-            LEGS_* that is out of range; torch.func or a re-entrant checkpoint together with torch.compile.
+            LEGS_* that is out of range; torch.func, a re-entrant checkpoint or an autograd.Function of the
+            codebase together with torch.compile.
 
     Examples:
         >>> target = torch.rand(3, 8, 8)
@@ -75,8 +76,10 @@ def l1_loss(
     """
     if not (isinstance(prediction, Tensor) and isinstance(target, Tensor)):
         read_pair(prediction, target)  # the error names which
-    if reduction not in ("mean", "none"):
+    if not isinstance(reduction, str) or reduction not in ("mean", "none"):
         raise LegsError(f'reduction must be "mean" or "none", got {reduction!r}')
+    if own is not None and not callable(own):
+        raise LegsError(f"own must be a function of (prediction, target), got {own!r}")
     if own is not None and (mask is not None or reduction != "mean"):
         raise LegsError("own= replaces mask= and reduction=: what it returns is returned")
     given = (mask, channels_last, reduction, own)
@@ -87,7 +90,7 @@ def l1_loss(
     if run is None or not (run.weighted or run.active):
         plain = _by_torch(prediction, target, Weights(), *given)
         counted.plain += 1
-        counted.plain_steps += trains
+        counted.plain_steps += trains and backward_pass() == -1
         if run is not None:
             run.say_what_is_used()
         return plain
@@ -101,7 +104,7 @@ def l1_loss(
     loss = fused(plan, image, photograph, masked) if mean else None
     if loss is None:
         loss = _by_torch(prediction, target, weights, *given)
-    counted.weighted += torch.is_grad_enabled()  # the second pass of a checkpoint counts, not the first
+    counted.weighted += backward_pass() == -1  # a checkpoint computes its loss again in the backward
     if not run.said:
         run.say_what_is_used()
     return loss
@@ -138,7 +141,11 @@ def _by_torch(
             types = prediction.dtype, target.dtype
             if not torch.promote_types(*types).is_floating_point or torch.bool in types:
                 raise LegsError(f"the images are of types {types}: give floats in [0, 1] (8-bit images: image / 255.0)")
-            return torch.abs(prediction - target).mean()
+            try:
+                return torch.abs(prediction - target).mean()
+            except RuntimeError:
+                read_pair(prediction, target, channels_last)  # names what does not fit
+                raise
     layout, prediction, target = read_pair(prediction, target, channels_last)
     weights = weights.with_map(target).masked(layout.map_first(mask, target, "mask"), renormalise=False)
     if mean:
@@ -171,6 +178,9 @@ def unweighted(function: Callable[..., Result]) -> Callable[..., Result]:
         >>> unweighted(photometric)(image, other) < photometric(image, other)
         tensor(True)
     """
+
+    if not callable(function):
+        raise LegsError(f"unweighted needs a function or a module, got {function!r}")
 
     def plain(*args: Any, **kwargs: Any) -> Result:
         thread.unweighted += 1

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.autograd import is_differentiated, is_in_a_node, is_transformed
-from legs_loss.config import Config, find_config
+from legs_loss.config import Config, find_config, store_folder
 from legs_loss.counting import Counts, at_end, counted, note_graph, reset_counts, say_first
 from legs_loss.errors import LegsError
 from legs_loss.images import shape_of
@@ -255,8 +255,9 @@ def spec_to_compile(number: int, is_trained: bool) -> Optional[WeightSpec]:
     if not is_trained:
         if run.active and (is_differentiated() or is_in_a_node()):
             raise LegsError(
-                "torch.func, forward-mode AD or a re-entrant checkpoint with torch.compile: the graph does not show "
-                "whether l1_loss is trained, so weighted. Leave one of them out, or call legs_loss, which always is"
+                "torch.func, forward-mode AD, a re-entrant checkpoint or a Function of autograd with torch.compile: "
+                "the graph does not show whether l1_loss is trained, so weighted. Leave one of them out, or call "
+                "legs_loss, which always is"
             )
         return None
     refuse_masks(number)
@@ -300,7 +301,7 @@ def configure(
         memo_bytes: how much memory remembered weight maps may take.
 
     Raises:
-        LegsError: an unknown preset, or settings elsewhere that are out of range.
+        LegsError: an unknown preset, a store that is no path, or settings elsewhere that are out of range.
 
     Examples:
         >>> configure("legs-l")
@@ -311,8 +312,9 @@ def configure(
     if spec is not None:
         preset = spec if isinstance(spec, str) else "own spec"
         config = replace(config, spec=as_spec(spec), preset=preset, source="configure()")
-    if store is not None:
-        config = replace(config, store=Path(store))
+    config = replace(config, store=store_folder(store, Path()) or config.store)
+    if not isinstance(memo_bytes, int) or memo_bytes < 0:
+        raise LegsError(f"memo_bytes must be a whole number of bytes, got {memo_bytes!r}")
     _replace(TrainingRun(config, memo_bytes))
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from legs_loss.autograd import check_order, is_compiling, is_trained
-from legs_loss.config import find_config, is_off
+from legs_loss.config import find_config, is_off, store_folder
 from legs_loss.counting import counted
 from legs_loss.images import Layout, read_pair
 from legs_loss.kernels.backends import fused, plan_of
@@ -19,7 +19,7 @@ from legs_loss.kernels.contract import SSIM
 from legs_loss.loss import legs_loss, total_loss, whole
 from legs_loss.runtime import state
 from legs_loss.runtime.state import MASK, TrainingRun, current_run, refuse_masks, thread
-from legs_loss.similarity import WINDOW_SIZE, ssim_map
+from legs_loss.similarity import WINDOW_SIZE, check_window, ssim_map
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.weights import Weights
 
@@ -116,6 +116,7 @@ def ssim(
         >>> round(float(ssim(image, image)), 5)
         1.0
     """
+    check_window(window_size, padding)
     layout, first, second = read_pair(img1, img2, channels_last)
     mask = layout.map_first(mask, second, "mask")
     swapped = not is_trained(first) and is_trained(second)
@@ -183,9 +184,11 @@ class LEGSLoss(torch.nn.Module):
         self.renormalise = renormalise
         self.channels_last = channels_last
         self._run: Optional[TrainingRun] = None
-        if store is not None:
+        whole(lambda_dssim, padding)  # checks them
+        folder = store_folder(store, Path())
+        if folder is not None:
             config = replace(find_config(None, argv=[]), spec=self.spec, preset="LEGSLoss", source="LEGSLoss()")
-            self._run = TrainingRun(replace(config, store=Path(store)))
+            self._run = TrainingRun(replace(config, store=folder))
 
     def forward(
         self, prediction: Tensor, target: Tensor, weight: Optional[Tensor] = None, mask: Optional[Tensor] = None
@@ -224,6 +227,8 @@ def _step(
     if is_compiling():
         refuse_masks(state.generation)
         return None
+    if not (isinstance(prediction, Tensor) and isinstance(target, Tensor)):
+        read_pair(prediction, target)  # the error names which
     if thread.unweighted or not (is_trained(prediction) or is_trained(target)):
         return None
     run = current_run()

@@ -56,4 +56,4 @@ def is_first_process() -> bool:
     if distributed is not None and distributed.is_available() and distributed.is_initialized():
         _was_first = distributed.get_rank() == 0
         return _was_first
-    return _was_first and os.environ.get("RANK", "0") in ("", "0")
+    return _was_first and not os.environ.get("RANK", "").strip("0").isdigit()

@@ -14,6 +14,7 @@ from torch.utils.checkpoint import checkpoint
 
 from legs_loss import LEGSLoss, WeightSpec, l1_loss, legs_loss, ssim, weight_map, weighted_l1
 from legs_loss.runtime import state
+from tests.loss.test_transforms import Contextual, SetUp
 from tests.support import legs_environment
 
 
@@ -117,6 +118,17 @@ class TestWithATransform:
             torch._dynamo.reset()
             with pytest.raises(Exception, match=r"with torch\.compile: the graph does not show"):
                 around()
+
+    @pytest.mark.parametrize("name", ["with a context", "with its own setup"])
+    def test_a_function_of_ours_in_a_graph(self, name):
+        function = {"with a context": Contextual, "with its own setup": SetUp}[name]
+        image, target = torch.rand(3, 9, 8, requires_grad=True), torch.rand(3, 9, 8)
+        with pytest.raises(Exception, match=r"with torch\.compile: the graph does not show"):
+            torch.compile(function.apply, backend="eager")(image, target)
+        torch._dynamo.reset()
+        with torch.no_grad():  # an evaluation has no node
+            found = torch.compile(function.apply, backend="eager")(image.detach(), target)
+        torch.testing.assert_close(found, (image - target).abs().mean().detach())
 
     def test_what_is_always_weighted_is_computed(self):
         image, target = torch.rand(3, 16, 20), torch.rand(3, 16, 20)

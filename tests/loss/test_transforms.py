@@ -262,6 +262,49 @@ class TestCheckpoint:
         assert counts().weighted - before == 1
 
 
+class Contextual(torch.autograd.Function):
+    """A codebase's own node around the loss, with the plain gradient."""
+
+    @staticmethod
+    def forward(context, image, target):
+        context.save_for_backward(image, target)
+        return l1_loss(image, target)
+
+    @staticmethod
+    def backward(context, gradient):
+        image, target = context.saved_tensors
+        return gradient * (image - target).sign() / image.numel(), None
+
+
+class SetUp(Contextual):
+    """The same in the form of torch 2: its forward has no context."""
+
+    @staticmethod
+    def forward(image, target):
+        return l1_loss(image, target)
+
+    @staticmethod
+    def setup_context(context, inputs, output):
+        context.save_for_backward(*inputs)
+
+
+class TestFunctionOfACodebase:
+    @pytest.mark.parametrize("function", [Contextual, pytest.param(SetUp, marks=needs_func)])
+    def test_it_is_weighted_and_counted(self, function):
+        image, target = images()
+        before = counts().weighted
+        value = function.apply(image.requires_grad_(), target)
+        value.backward()
+        torch.testing.assert_close(value.double(), l1_by_hand(image.double(), target), rtol=1e-5, atol=1e-7)
+        assert counts().weighted - before == 1
+        assert float(function.apply(image.detach(), target)) == pytest.approx(float(plain(image, target)))
+
+    def test_an_evaluation_is_plain(self):
+        image, target = images()
+        with torch.no_grad():
+            assert float(Contextual.apply(image.requires_grad_(), target)) == pytest.approx(float(plain(image, target)))
+
+
 class TestStore:
     @pytest.fixture
     def target(self, tmp_path):

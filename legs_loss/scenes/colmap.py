@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Callable, Dict, Iterator, List, Optional, Tuple
+from typing import Any, BinaryIO, Callable, Dict, Iterator, List, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -25,15 +25,13 @@ MODELS = {
     **{"EUCM": 6, "EQUIRECTANGULAR": 2},
 }
 
-_CAMERA_LINE = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
-_IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-_POINT_LINE = "POINT3D_ID X Y Z R G B ERROR TRACK..."
 _LARGEST = 2 << 30  # bytes of a text, which is read whole; of a binary file as much is read as its counts say
 _LONGEST = 4096  # bytes of an image's name
 _FARTHEST_CAMERA = 1e12  # in the scene's unit: what float32 can still compute with
 
 
 _Lens = Tuple[str, Optional[Camera]]  # the model's name; a pinhole as it stands in the origin
+_Record = Tuple[Sequence[Any], int]  # of a binary file: the values, and how many bytes to skip
 _Image = Tuple[str, int, np.ndarray]  # its name, its camera's number, and [4, 4], world -> camera
 
 
@@ -88,126 +86,70 @@ def _larger_models(root: Path, model: Path, count: int) -> Tuple[str, ...]:
 
 def _read(path: Path) -> Any:
     """Return the cameras by number, the images or the points of a model's file, by its name."""
-    binary, text = _READERS[path.stem]
+    record, make, join, splits, layout = _FILES[path.stem]
     try:
         if path.suffix == ".txt":
-            return text(read_text(path, _LARGEST))
+            return join(list(_of_lines(read_text(path, _LARGEST), make, splits, layout)))
         with open_regular(path) as file:
-            cursor = _Cursor(file)
-            found = binary(cursor)
-            if file.tell() != cursor.size:
-                raise ValueError(f"{cursor.size} bytes where its own counts say {file.tell()}")
-            return found
+            size, found = os.fstat(file.fileno()).st_size, []
+            for _ in range(_take(file, "Q")[0]):
+                values, skipped = record(file)
+                found.append(make(*values))
+                if skipped > size - file.tell():
+                    raise ValueError("it ends too early")
+                file.seek(skipped, os.SEEK_CUR)
+            if file.tell() != size:
+                raise ValueError(f"{size} bytes where its own counts say {file.tell()}")
+            return join(found)
     except OSError as error:
         raise LegsError(f"cannot read {path}: {error.strerror}") from None
     except (struct.error, ValueError, OverflowError) as error:
         raise LegsError(f"{path} is not as COLMAP writes it: {error}") from None
 
 
-class _Cursor:
-    """Reads a binary file from front to back; at its end all of it must be read."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self.file, self.size = file, os.fstat(file.fileno()).st_size
-
-    def take(self, layout: str) -> Tuple[Any, ...]:
-        return struct.unpack(f"<{layout}", self.file.read(struct.calcsize(f"<{layout}")))
-
-    def name(self) -> str:
-        start = self.file.tell()
-        name, end, _ = self.file.read(_LONGEST).partition(b"\0")
-        if not end:
-            raise ValueError("a name does not end")
-        self.file.seek(start + len(name) + 1)
-        try:
-            return name.decode()
-        except UnicodeDecodeError:
-            raise ValueError(f"the name {str(name)[1:]} of an image is not in UTF-8") from None
-
-    def skip(self, size: int) -> None:
-        if size > self.size - self.file.tell():
-            raise ValueError("it ends too early")
-        self.file.seek(size, os.SEEK_CUR)
-
-
-def _cameras_bin(cursor: _Cursor) -> Dict[int, _Lens]:
-    cameras = []
-    for _ in range(cursor.take("Q")[0]):
-        number, model, width, height = cursor.take("iiQQ")
-        if not 0 <= model < len(MODELS):
-            known = f"known here are 0 to {len(MODELS) - 1}"
-            raise ValueError(f"camera {number} has model {model}; {known}: convert it to text (colmap model_converter)")
-        name = list(MODELS)[model]
-        cameras.append(_camera(number, name, width, height, *cursor.take(f"{MODELS[name]}d")))
-    return dict(cameras)
-
-
-def _images_bin(cursor: _Cursor) -> List[_Image]:
-    images = []
-    for _ in range(cursor.take("Q")[0]):
-        record = (*cursor.take("i7di"), cursor.name())
-        images.append(_image(*record))
-        cursor.skip(24 * cursor.take("Q")[0])  # the image's points, each x, y and an id
-    return images
-
-
-def _points_bin(cursor: _Cursor) -> PointCloud:
-    points = []
-    for _ in range(cursor.take("Q")[0]):
-        *point, track = cursor.take("Q3d3BdQ")
-        points.append(point[1:7])
-        cursor.skip(8 * track)  # pairs of an image and a point in it
-    return _cloud(points)
-
-
-Lines = Iterator[Tuple[int, str]]  # with their numbers
-
-
-def _rows(text: str, layout: str, read: Callable[[str, Lines], Any]) -> List[Any]:
-    """Return what is read of the lines that are no comments and not empty; ``read`` may take further ones."""
+def _of_lines(text: str, make: Callable[..., Any], splits: int, layout: str) -> Iterator[Any]:
+    """Yield what is made of the values of each line that is no comment and not empty."""
     # Not by splitlines(), which also ends a line at characters that a name may have.
     lines = ((n, line) for n, line in enumerate(re.split(r"\r\n?|\n", text), 1) if not line.lstrip().startswith("#"))
-    rows = []
     for number, line in lines:
         if line.strip():
             try:
-                rows.append(read(line, lines))
+                yield make(*line.rstrip().split(None, splits))
+                if make is _image:
+                    _check_points(*next(lines, (0, "")))
             except (ValueError, TypeError) as error:
                 why = "too few values" if isinstance(error, TypeError) else error
                 raise ValueError(f"line {number}, {line.strip()[:80]!r}: {why} (expected: {layout})") from None
-    return rows
 
 
-def _cameras_txt(text: str) -> Dict[int, _Lens]:
-    return dict(_rows(text, _CAMERA_LINE, lambda line, _: _camera(*line.split())))
+def _take(file: BinaryIO, layout: str) -> Tuple[Any, ...]:
+    return struct.unpack(f"<{layout}", file.read(struct.calcsize(f"<{layout}")))
 
 
-def _images_txt(text: str) -> List[_Image]:
-    def image(line: str, lines: Lines) -> _Image:
-        found = _image(*line.rstrip().split(None, 9))  # the name comes last and may have spaces
-        number, points = next(lines, (0, ""))
-        if not _are_points(points.split()):
-            raise ValueError(
-                f"line {number} should have its points, X Y POINT3D_ID each: an image has two lines, and the second "
-                f"may be empty, but is {points.strip()[:80]!r}"
-            )
-        return found
-
-    return _rows(text, f"{_IMAGE_LINE}, then a line of points", image)
+def _camera_record(file: BinaryIO) -> _Record:
+    number, model, width, height = _take(file, "iiQQ")
+    if not 0 <= model < len(MODELS):
+        known = f"known here are 0 to {len(MODELS) - 1}"
+        raise ValueError(f"camera {number} has model {model}; {known}: convert it to text (colmap model_converter)")
+    name = list(MODELS)[model]
+    return (number, name, width, height, *_take(file, f"{MODELS[name]}d")), 0
 
 
-def _are_points(words: List[str]) -> bool:
+def _image_record(file: BinaryIO) -> _Record:
+    values, start = _take(file, "i7di"), file.tell()
+    name, end, _ = file.read(_LONGEST).partition(b"\0")
+    if not end:
+        raise ValueError("a name does not end")
+    file.seek(start + len(name) + 1)
     try:
-        return len([float(word) for word in words]) % 3 == 0
-    except ValueError:
-        return False
+        return (*values, name.decode()), 24 * _take(file, "Q")[0]  # its points, each x, y and an id
+    except UnicodeDecodeError:
+        raise ValueError(f"the name {str(name)[1:]} of an image is not in UTF-8") from None
 
 
-def _points_txt(text: str) -> PointCloud:
-    def point(_: str, x: str, y: str, z: str, r: str, g: str, b: str, *track: str) -> List[float]:
-        return [float(x), float(y), float(z), int(r), int(g), int(b)]
-
-    return _cloud(_rows(text, _POINT_LINE, lambda line, _: point(*line.split(None, 7))))
+def _point_record(file: BinaryIO) -> _Record:
+    *values, track = _take(file, "Q3d3BdQ")
+    return values, 8 * track  # pairs of an image and a point in it
 
 
 def _camera(number: Any, model: str, width: Any, height: Any, *params: Any) -> Tuple[int, _Lens]:
@@ -238,12 +180,27 @@ def _image(_: Any, w: Any, x: Any, y: Any, z: Any, tx: Any, ty: Any, tz: Any, ca
     return name, int(camera_id), pose
 
 
+def _check_points(number: int, points: str) -> None:
+    """Check the second line of an image: it has three numbers a point, and may be empty."""
+    with suppress(ValueError):
+        if len([float(word) for word in points.split()]) % 3 == 0:
+            return
+    raise ValueError(
+        f"line {number} should have its points, X Y POINT3D_ID each: an image has two lines, and the second "
+        f"may be empty, but is {points.strip()[:80]!r}"
+    )
+
+
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
     """Return [3, 3] of a quaternion w, x, y, z of any length: v -> 2 u (u.v) + (w^2 - u.u) v + 2w u x v."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     u = np.array([x, y, z])
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return 2 * np.outer(u, u) + (w * w - u @ u) * np.eye(3) + 2 * w * cross
+
+
+def _point(_: Any, x: Any, y: Any, z: Any, r: Any, g: Any, b: Any, *__: Any) -> List[float]:
+    return [float(x), float(y), float(z), int(r), int(g), int(b)]
 
 
 def _cloud(points: List[Any]) -> PointCloud:
@@ -257,8 +214,10 @@ def _cloud(points: List[Any]) -> PointCloud:
     return PointCloud(positions.astype(np.float32), colours.astype(np.uint8))
 
 
-_READERS = {
-    "cameras": (_cameras_bin, _cameras_txt),
-    "images": (_images_bin, _images_txt),
-    "points3D": (_points_bin, _points_txt),
+# Of a model's files: what reads a record of a binary one, what checks its values or a line's, what is made of all, how
+# often at most a line is split (a name may have spaces, a track may be long), and what stands in a line.
+_FILES: Dict[str, Tuple[Any, ...]] = {
+    "cameras": (_camera_record, _camera, dict, -1, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."),
+    "images": (_image_record, _image, list, 9, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of points"),
+    "points3D": (_point_record, _point, _cloud, 8, "POINT3D_ID X Y Z R G B ERROR TRACK..."),
 }

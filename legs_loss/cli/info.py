@@ -32,9 +32,7 @@ def run(args: argparse.Namespace) -> int:
     path = Path(args.store)
     if (path / STORE_FOLDER).is_dir():
         path = path / STORE_FOLDER
-    if not path.exists():
-        raise LegsError(f"there is no folder {path}: give a store, or the scene that has one")
-    if path.is_dir() and not (path / MANIFEST).is_file():
+    if not (path / MANIFEST).is_file():
         raise LegsError(_without_store(path))
     try:
         store = WeightStore(path)

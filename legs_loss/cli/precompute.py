@@ -16,7 +16,7 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Dict, Iterable, Optional, Tuple
+from typing import TYPE_CHECKING, Any, Dict, Iterable, Tuple
 
 from legs_loss.cli.shared.scene_arguments import add_images, add_resolution, say_notes, say_skipped
 from legs_loss.system.machine import cores
@@ -94,7 +94,7 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     from legs_loss.errors import LegsError
     from legs_loss.precompute.many_scenes import SceneTask, find_scenes, stores_of
     from legs_loss.precompute.user_maps import UserMaps
-    from legs_loss.scenes import read_scene
+    from legs_loss.scenes import from_anywhere, read_scene
 
     workers = args.workers if args.workers is not None else cores() if args.scheduler is None else 1
     if workers < 1:
@@ -115,18 +115,12 @@ def _tasks(args: argparse.Namespace) -> Dict[SceneTask, Path]:
     if args.out is not None:
         stores[0].parent.mkdir(parents=True, exist_ok=True)
 
-    def found(named: Optional[str], scene: Path) -> Optional[str]:
-        """Return a path that is in the scene as it was named, and others whole."""
-        if named is None or (scene / named).exists() or not os.path.exists(named):
-            return named
-        return os.path.abspath(str(named))
-
     settings = args.preset, args.resolution, args.white_background, workers
     tasks = {}
     for scene, store in zip(scenes, stores):
-        maps = UserMaps(found(args.masks, scene), found(args.weights, scene), args.weight_scale)
+        images, masks, weights = (from_anywhere(scene, named) for named in (args.images, args.masks, args.weights))
         root, out = Path(os.path.abspath(str(scene))), Path(os.path.abspath(str(store)))
-        tasks[SceneTask(root, out, found(args.images, scene), maps, settings)] = store
+        tasks[SceneTask(root, out, images, UserMaps(masks, weights, args.weight_scale), settings)] = store
     return tasks
 
 

@@ -104,7 +104,7 @@ def _computed(view: View, spec: WeightSpec, scene: Optional[Tensor], mask: Optio
     else:
         normalised = over_scene(response_map(photograph, spec)[None], spec, scene)[0].numpy()
     height, width = normalised.shape
-    return Shown(view.name, photograph, normalised, None if mask is None else averaged(mask(), (width, height)))
+    return Shown(view.name, photograph, normalised, 1.0 if mask is None else averaged(mask(), (width, height)))
 
 
 def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
@@ -128,7 +128,7 @@ def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
             levels = store.scene_levels(spec, entry.width * entry.height)
             normalised = over_scene(torch.from_numpy(store.response(entry))[None], spec, levels)[0].numpy()
         found = [store.beside(entry, kind) for kind in (MASK, WEIGHTS)]
-        mask, weights = (None if one is None else store.user_map(one) for one in found)
+        mask, weights = (1.0 if one is None else store.user_map(one) for one in found)
         return Shown(f"{entry.view}\n{entry.width}x{entry.height}", photograph, normalised, mask, weights)
 
     # Of a view with several sizes, the largest comes last and stays.
@@ -142,15 +142,14 @@ def _stored(path: Path, spec: WeightSpec) -> Dict[str, Callable[[], Shown]]:
 def _photograph(view: View, entry: Entry) -> Optional[np.ndarray]:
     """Return the image that a map was made from, None if it is missing or has changed."""
     from legs_loss.errors import LegsError
-    from legs_loss.scenes import image_size, load_training_image, training_size
+    from legs_loss.scenes import load_training_image
     from legs_loss.store import fingerprint
 
     with suppress(LegsError):
-        size = image_size(view.path)
         for resolution in (-1, 1, 2, 4, 8, entry.width):
-            if training_size(*size, resolution) == (entry.width, entry.height):
-                photograph = load_training_image(view, resolution, entry.background == "white")
-                return photograph if fingerprint(photograph) == entry.fingerprint else None
+            photograph = load_training_image(view, resolution, entry.background == "white")
+            if fingerprint(photograph) == entry.fingerprint:
+                return photograph
     return None
 
 

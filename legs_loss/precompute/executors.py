@@ -12,10 +12,12 @@ import multiprocessing
 import os
 import platform
 import signal
+import sys
 import uuid
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from functools import partial
+from importlib import import_module
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Callable, Dict, Generator, Iterable, Iterator, Optional, Tuple
@@ -97,27 +99,17 @@ def keep_ctrl_c_from_children() -> Iterator[None]:
     On Windows, where signals cannot be delayed, it is ignored meanwhile.
     """
     if hasattr(signal, "pthread_sigmask"):
-        _ensure_tracker()  # started by the first process, it would let signals through again
-        held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            yield  # the mask is inherited, for good
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, held)
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # Multiprocessing's resource tracker: started by the first process, it would let signals through again.
+        tracker = "resource_tracker" if sys.version_info >= (3, 8) else "semaphore_tracker"
+        import_module(f"multiprocessing.{tracker}").ensure_running()
+        held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited, for good
+        restore: Callable[[], Any] = partial(signal.pthread_sigmask, signal.SIG_SETMASK, held)
+    else:
+        restore = partial(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _ensure_tracker() -> None:
-    """Start multiprocessing's resource tracker, if it does not run."""
-    try:
-        from multiprocessing.resource_tracker import ensure_running
-    except ImportError:  # Python 3.7's name
-        from multiprocessing.semaphore_tracker import ensure_running  # type: ignore[no-redef]
-    ensure_running()
+        restore()
 
 
 def _in_processes(task: Work, arguments: Iterable[Any], processes: int, listen: Listener) -> Outcomes:

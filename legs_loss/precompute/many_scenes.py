@@ -97,10 +97,9 @@ def precompute_scene(task: SceneTask, tell: Listener) -> Report:
     Raises:
         LegsError: as :func:`~legs_loss.precompute.precompute`, or this machine does not see the scene.
     """
-    if not task.scene.is_dir():
-        raise LegsError(f"there is no folder {task.scene} here: is the file system with the scenes mounted?")
-    if not task.store.parent.is_dir():  # made here it would be on this machine's own disk
-        raise LegsError(f"there is no folder {task.store.parent} here: is the file system for the stores mounted?")
+    for folder, what in ((task.scene, "scenes"), (task.store.parent, "stores")):  # made here it would be on an own disk
+        if not folder.is_dir():
+            raise LegsError(f"there is no folder {folder} here: is the file system with the {what} mounted?")
     scene = read_scene(task.scene, task.images)
     due = 0.0
 

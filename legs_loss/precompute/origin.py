@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Optional
 
 from legs_loss.errors import LegsError
-from legs_loss.scenes import Scene, read_scene
+from legs_loss.scenes import Scene, from_anywhere, read_scene
 from legs_loss.system.files import read_regular, write_whole
 
 NOTE = "scene.json"
@@ -25,11 +25,8 @@ def note_scene(store: Path, scene: Scene) -> None:
     Raises:
         LegsError: the note cannot be written.
     """
-    images = None if scene.images is None else str(scene.images)
-    if images is not None and not (scene.root / images).is_dir():
-        images = os.path.abspath(images)
-    text = json.dumps({"scene": os.path.abspath(str(scene.root)), "images": images}, indent=1) + "\n"
-    write_whole(store / NOTE, text.encode())
+    note = {"scene": os.path.abspath(str(scene.root)), "images": from_anywhere(scene.root, scene.images)}
+    write_whole(store / NOTE, f"{json.dumps(note, indent=1)}\n".encode())
 
 
 def scene_of_store(store: Path) -> Optional[Scene]:

@@ -70,11 +70,6 @@ def stage_user_maps(
     if masked and maps.masks is None:
         notes.append(f"transforms.json names masks of {masked} photograph(s): --masks mask_path applies them")
     given = {kind: named for kind, named in ((MASK, maps.masks), (WEIGHTS, maps.weights)) if named is not None}
-    for entry in known:
-        if entry.is_users and entry.operator not in given:
-            raise LegsError(
-                f"the store has maps of {_OPTIONS[entry.operator]}: give that option again, or delete the store"
-            )
     sizes: Dict[str, Tuple[int, int]] = {}
     for view in views if given else ():
         with suppress(LegsError):  # its photograph is skipped later, with the reason
@@ -82,6 +77,8 @@ def stage_user_maps(
     views = [view for view in views if view.name in sizes]
     trained = {name: {training_size(*size, resolution)} for name, size in sizes.items()}
     for entry in known:
+        if entry.is_users and entry.operator not in given:
+            raise LegsError(f"the store has maps of {_OPTIONS[entry.operator]}: give it again, or delete the store")
         if not entry.is_users and entry.view in trained:
             trained[entry.view].add((entry.width, entry.height))
     for kind, named in given.items():

@@ -49,6 +49,16 @@ def read_scene(path: Union[str, Path], images: Optional[str] = None) -> Scene:
     return replace(scene, images=images, views=tuple(sorted(scene.views, key=lambda view: view.name)))
 
 
+def from_anywhere(root: Path, named: Optional[str]) -> Optional[str]:
+    """Return a folder or file that was named for a scene, in it or by a path, so that other current folders have it.
+
+    What is in the scene stays as it was named, and so does what is nowhere.
+    """
+    if named is None or (root / named).exists() or not os.path.exists(named):
+        return named
+    return os.path.abspath(named)
+
+
 def _images_folder(root: Path, images: str) -> Tuple[Path, str]:
     """Return the folder of the photographs and the prefix of their names."""
     folder = root / images  # pathlib keeps an absolute ``images`` as it is

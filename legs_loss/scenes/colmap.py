@@ -167,11 +167,9 @@ def _camera(number: Any, model: str, width: Any, height: Any, *params: Any) -> T
 
 def _image(_: Any, w: Any, x: Any, y: Any, z: Any, tx: Any, ty: Any, tz: Any, camera_id: Any, name: str) -> _Image:
     """Return an image by the values of its line, or of its record."""
-    if not name or "\0" in name:
-        raise ValueError(f"an image has the name {name!r}, which no file can have")
     parts = name.replace("\\", "/").split("/")
-    if ".." in parts or not parts[0] or os.path.isabs(name):
-        raise ValueError(f"an image has the name {name!r}, which leads out of the scene")
+    if "\0" in name or ".." in parts or not parts[0] or os.path.isabs(name):
+        raise ValueError(f"an image has the name {name!r}, which no file can have, or which leads out of the scene")
     quaternion, translation = (np.array(values, np.float64) for values in ((w, x, y, z), (tx, ty, tz)))
     if not (1e-150 < np.abs(quaternion).max() < 1e150 and np.abs(translation).max() < _FARTHEST_CAMERA):  # NaN is not
         raise ValueError(f"the pose of {name!r} is not a number")

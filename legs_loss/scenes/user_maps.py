@@ -125,14 +125,11 @@ def read_map_file(path: Path, size: Tuple[int, int]) -> np.ndarray:
         _check_ratio(image.size, size)
         if image.mode.startswith("I"):
             return _unit(deep_gray(image), 65535)
-        mode = colour_mode(image)
-        pixels = np.asarray(image.convert(mode)).astype(np.int16)
-        if mode == "L":
-            return _unit(pixels, 255)
-        opacity = pixels[..., 3] if mode == "RGBA" else np.full(pixels.shape[:2], 255, np.int16)
-        if (np.ptp(pixels[..., :3], -1)[opacity > 0] > _GRAY).any():
+        pixels = np.asarray(image.convert(colour_mode(image)).convert("RGBA")).astype(np.int16)
+        colours, opacity = pixels[..., :3], pixels[..., 3]
+        if (np.ptp(colours, -1)[opacity > 0] > _GRAY).any():
             raise LegsError("in colour, and a map is gray (for a photograph's own alpha: --masks alpha)")
-        return (_unit(pixels[..., :3], 255).mean(-1) * (opacity / 255.0)).astype(np.float32)
+        return _unit(colours.mean(-1), 255) * (opacity / 255.0).astype(np.float32)
 
 
 def _unit(values: np.ndarray, white: int) -> np.ndarray:

@@ -134,8 +134,8 @@ def test_the_sheet_has_a_row_for_the_mask(tmp_path):
     pytest.importorskip("matplotlib")
     view = np.linspace(0, 1, 600, dtype=np.float32).reshape(20, 30)
     sizes = []
-    for mask in (None, (view > 0.5).astype(np.float32)):
-        views = [Shown("a", None, view, mask), Shown("b", None, view, None, 2 * view)]
+    for mask in (1.0, (view > 0.5).astype(np.float32)):
+        views = [Shown("a", None, view, mask), Shown("b", None, view, 1.0, 2 * view)]
         save_sheet(tmp_path / "sheet.png", views, PRESETS["legs"], "title")
         sizes.append(Image.open(tmp_path / "sheet.png").size[1])
     assert sizes[1] > sizes[0]

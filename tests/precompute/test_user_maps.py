@@ -300,7 +300,7 @@ class TestRefused:
     def test_a_store_with_masks_asks_for_them_again(self, scene):
         precompute(read_scene(scene), maps=UserMaps("masks"))
         before = sorted(path.name for path in (scene / "legs_weights").iterdir())
-        with pytest.raises(LegsError, match="has maps of --masks: give that option again"):
+        with pytest.raises(LegsError, match="has maps of --masks: give it again"):
             precompute(read_scene(scene), resolution=2)
         assert sorted(path.name for path in (scene / "legs_weights").iterdir()) == before
 

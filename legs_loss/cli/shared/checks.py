@@ -26,11 +26,8 @@ def check_resolution(resolution: int, views: Sequence[View]) -> None:
         size = image_size(views[0].path)
     width, height = training_size(*(size or (1 << 20, 1 << 20)), resolution)
     if size is not None and resolution not in (-1, 1, 2, 4, 8) and width < min(_TINY, size[0]):
-        say(
-            f"legs: warning: -r {resolution} makes images of {width}x{height} pixels: as in 3DGS, 1, 2, 4 and 8 divide "
-            "the size, and any other number is the width",
-            sys.stderr,
-        )
+        why = "as in 3DGS, 1, 2, 4 and 8 divide the size, and any other number is the width"
+        say(f"legs: warning: -r {resolution} makes images of {width}x{height} pixels: {why}", sys.stderr)
 
 
 def check_empty(folder: Path) -> None:
@@ -52,8 +49,7 @@ def check_writable(folder: Path) -> None:
     """
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
-        with tempfile.TemporaryFile(dir=str(there)):
-            pass
+        tempfile.TemporaryFile(dir=str(there)).close()
     except OSError as error:
         where = "" if there == folder else f": {there}"
         raise LegsError(f"cannot write to {folder}{where}: {error.strerror or error}") from None

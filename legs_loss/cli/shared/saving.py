@@ -25,10 +25,7 @@ def save_figure(figure: Any, path: Union[str, Path], dpi: int) -> None:
     Raises:
         LegsError: matplotlib does not know the format, or the file cannot be written.
     """
-    form = Path(path).suffix[1:] or "png"
-    try:
-        write_whole(path, lambda file: figure.savefig(file, format=form, dpi=dpi, facecolor="white"))
-    except LegsError:
-        raise
-    except ValueError as error:
-        raise LegsError(f"cannot write {path}: {error}") from None
+    form, known = Path(path).suffix[1:].lower() or "png", figure.canvas.get_supported_filetypes()
+    if form not in known:
+        raise LegsError(f"cannot write {path}: matplotlib writes {', '.join(known)}, not {form}")
+    write_whole(path, lambda file: figure.savefig(file, format=form, dpi=dpi, facecolor="white"))

@@ -21,14 +21,14 @@ class Shown(NamedTuple):
     """One view of a sheet: its label, its photograph uint8 or uint16 [H, W, C] if there is one, its E^ [H, W].
 
     For a spec that is normalised over the scene, E^ is its response normalised so. The user's own mask and weights are
-    factors of the weight, [H, W].
+    factors of the weight, [H, W], or 1.
     """
 
     label: str
     photograph: Optional[np.ndarray]
     normalised: np.ndarray
-    mask: Optional[np.ndarray] = None
-    weights: Optional[np.ndarray] = None
+    mask: Union[np.ndarray, float] = 1.0
+    weights: Union[np.ndarray, float] = 1.0
 
 
 def save_sheet(path: Union[str, Path], views: Sequence[Shown], spec: WeightSpec, title: str) -> None:
@@ -42,7 +42,7 @@ def save_sheet(path: Union[str, Path], views: Sequence[Shown], spec: WeightSpec,
     require("a picture", "report", "matplotlib")
     from matplotlib.figure import Figure
 
-    rows = 4 if any(view.mask is not None for view in views) else 3
+    rows = 4 if any(np.ndim(view.mask) for view in views) else 3
     aspect = max(view.normalised.shape[0] / view.normalised.shape[1] for view in views)
     column = min(4.2, 3.6 / aspect)
     width, height = column * len(views) + 1.4, rows * column * aspect
@@ -58,8 +58,8 @@ def save_sheet(path: Union[str, Path], views: Sequence[Shown], spec: WeightSpec,
 def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) -> None:
     """Fill cells [rows, views] and the colour bars of the rows: photograph, mask if there is one, response, weight."""
     masked = len(cells) == 4
-    factors = [factor for view in views for factor in (view.mask, view.weights) if factor is not None]
-    most = max([float(view.weights.max()) for view in views if view.weights is not None], default=1.0)
+    least = 0 if masked or any(np.ndim(view.weights) for view in views) else 1
+    most = max(float(np.max(view.weights)) for view in views)
     # A few pixels own the maximum: shown up to it, a response is all black.
     brightest = max(float(np.quantile(view.normalised.astype(np.float32), 0.99)) for view in views) or 1.0
     for column, view in enumerate(views):
@@ -68,20 +68,19 @@ def _draw_maps(cells: Any, bars: Any, views: Sequence[Shown], spec: WeightSpec) 
             axes.set(xticks=[], yticks=[], frame_on=False)
         weighted_by = curved if spec.over == "scene" else weight_from_response
         weight = weighted_by(torch.from_numpy(view.normalised.astype(np.float32))[None], spec)[0].numpy()
-        for factor in (view.mask, view.weights):
-            weight = weight if factor is None else weight * factor
+        weight = weight * view.mask * view.weights
+        mask = np.ones_like(weight) * view.mask
         if masked:
-            shown = np.ones_like(weight) if view.mask is None else view.mask
-            cells[1, column].imshow(shown, cmap="gray", vmin=0, vmax=1)
+            cells[1, column].imshow(mask, cmap="gray", vmin=0, vmax=1)
         if view.photograph is None:
             photograph.text(0.5, 0.5, "not found,\nor changed since", ha="center", va="center", color=_FAINT)
         else:
             unit = view.photograph / np.float32(np.iinfo(view.photograph.dtype).max)
             photograph.imshow(unit.squeeze(-1) if unit.shape[-1] == 1 else unit, cmap="gray", vmin=0, vmax=1)
         strengths = response.imshow(view.normalised.astype(np.float32), cmap="magma", vmin=0, vmax=brightest)
-        weights = weighted.imshow(weight, cmap="viridis", vmin=0 if factors else 1, vmax=(1 + (spec.beta or 1)) * most)
-        mean = weight.sum() / (weight.size if view.mask is None else max(float(view.mask.sum()), 1e-9))
-        over = "" if view.mask is None else " of what counts"
+        weights = weighted.imshow(weight, cmap="viridis", vmin=least, vmax=(1 + (spec.beta or 1)) * most)
+        mean = weight.sum() / max(float(mask.sum()), 1e-9)
+        over = " of what counts" if np.ndim(view.mask) else ""
         weighted.set_xlabel(f"mean weight{over} {mean:.2f}", fontsize=9, color=_INK)
         photograph.set_title(label(view.label), fontsize=10, color=_INK)
     names = ["photograph", *(["mask"] if masked else []), r"response  $\hat{E}$", "weight  $W$"]

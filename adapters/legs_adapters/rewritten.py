@@ -15,8 +15,7 @@ import sys
 import threading
 import types
 from pathlib import Path
-from types import CodeType
-from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Tuple, Type
+from typing import Any, Callable, Dict, Optional, Sequence, Tuple, Type
 
 _BEFORE_THE_SCRIPT = (__name__, "importlib", "_frozen_importlib")  # modules that load it
 
@@ -45,9 +44,7 @@ def execute(words: Sequence[str], sources: Dict[str, bytes], cpu_root: Optional[
             runpy.run_module(words[1], run_name="__main__", alter_sys=True)
         else:
             sys.argv[:], sys.path[0] = words, os.path.dirname(os.path.realpath(words[0]))
-            file = _as_python_names(words[0])
-            sys.modules["__main__"] = main = main_module("__main__", file)
-            exec(Loader("__main__", file, sources).get_code("__main__"), main.__dict__)
+            _run_main(_as_python_names(words[0]), "__main__")
     except passed_on:
         raise
     except BaseException as error:
@@ -94,19 +91,34 @@ def install(sources: Dict[str, bytes]) -> None:
     A process that is spawned (`torch.multiprocessing.spawn`, DataLoader workers) starts as a new Python, which imports
     the script again: it installs the same sources before.
     """
-    sys.meta_path.insert(0, SourceFinder(sources))
-    call_when_spawned(install, sources)
+    loader: Any = importlib.machinery.SourceFileLoader
     spawn: Any = multiprocessing.spawn
+    read, stats = loader.get_data, loader.path_stats
+
+    def get_data(self: Any, path: str) -> bytes:
+        data = sources.get(os.path.realpath(path))
+        if data is None:
+            return read(self, path)
+        text = importlib.util.decode_source(data)
+        # Without a time of last change, linecache does not look at the disk again.
+        linecache.cache[path] = (len(text), None, text.splitlines(keepends=True), path)
+        vars(builtins)["legs_loss"] = importlib.import_module("legs_loss")  # the name in the text has no import
+        return data
+
+    def path_stats(self: Any, path: str) -> Any:
+        if os.path.realpath(path) in sources:
+            raise OSError  # no bytecode of it is read or written
+        return stats(self, path)
 
     def import_main(path: str) -> None:  # as multiprocessing does, which reads the file
         if getattr(sys.modules["__main__"], "__file__", None) == path:
             return
         spawn.old_main_modules.append(sys.modules["__main__"])
-        module = main_module("__mp_main__", path)
-        exec(Loader("__mp_main__", path, sources).get_code("__mp_main__"), module.__dict__)
-        sys.modules["__main__"] = sys.modules["__mp_main__"] = module
+        _run_main(path, "__mp_main__", "__main__")
 
+    loader.get_data, loader.path_stats = get_data, path_stats
     spawn._fixup_main_from_path = import_main
+    call_when_spawned(install, sources)
 
 
 def call_when_spawned(function: Callable[[Any], None], argument: Any) -> None:
@@ -127,53 +139,10 @@ class _SpawnedCall:
         return self._call
 
 
-class Loader(importlib.machinery.SourceFileLoader):
-    """Load a file's rewritten source, ``data``, in place of the file; no bytecode cache is read or written.
-
-    ``data`` is None for a file that was not rewritten: it is loaded as it is.
-    """
-
-    def __init__(self, name: str, path: str, sources: Mapping[str, bytes]) -> None:
-        super().__init__(name, path)
-        self.data: Optional[bytes] = sources.get(os.path.realpath(path))
-
-    def get_data(self, path: str | os.PathLike[str]) -> bytes:
-        """Return the source; other files as they are on disk."""
-        if self.data is not None and os.fspath(path) == self.path:
-            return self.data
-        return super().get_data(os.fspath(path))
-
-    def get_code(self, fullname: str) -> CodeType:
-        """Compile the source, and let tracebacks quote it."""
-        data = self.get_data(self.path)
-        if self.data is not None:
-            text = importlib.util.decode_source(data)
-            # Without a time of last change, linecache does not look at the disk again.
-            linecache.cache[self.path] = (len(text), None, text.splitlines(keepends=True), self.path)
-            vars(builtins)["legs_loss"] = importlib.import_module("legs_loss")  # the name in the text has no import
-        return self.source_to_code(data, self.path)
-
-
-class SourceFinder:
-    """Find modules as Python does, and replace the loader of rewritten ones."""
-
-    def __init__(self, sources: Dict[str, bytes]) -> None:
-        self._sources = sources
-
-    def find_spec(
-        self, name: str, path: Optional[Sequence[str]] = None, target: Optional[types.ModuleType] = None
-    ) -> Optional[importlib.machinery.ModuleSpec]:
-        """Return the spec of a module that was rewritten; None for any other."""
-        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
-        if spec is None or not spec.origin or type(spec.loader) is not importlib.machinery.SourceFileLoader:
-            return None
-        spec.loader = loader = Loader(name, spec.origin, self._sources)
-        return None if loader.data is None else spec
-
-
-def main_module(name: str, script: str) -> types.ModuleType:
-    """Return an empty module with the attributes that Python gives a script that it runs."""
-    module = types.ModuleType(name)
-    module.__loader__ = importlib.machinery.SourceFileLoader(name, script)
-    module.__dict__.update(__file__=script, __builtins__=builtins, __cached__=None, __annotations__={})
-    return module
+def _run_main(script: str, *names: str) -> None:
+    """Run a file as the main module, with the attributes that Python gives it, under these names."""
+    main = types.ModuleType(names[0])
+    main.__loader__ = loader = importlib.machinery.SourceFileLoader(names[0], script)
+    main.__dict__.update(__file__=script, __builtins__=builtins, __cached__=None, __annotations__={})
+    sys.modules.update(dict.fromkeys(names, main))
+    exec(compile(loader.get_data(script), script, "exec", dont_inherit=True), main.__dict__)

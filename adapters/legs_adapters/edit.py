@@ -49,7 +49,7 @@ def rewrite(findings: Findings, path: str, in_place: bool = False) -> List[Edit]
     for use in (each for each, _ in findings.unweighted if each.caller.module.path == path):
         text = Text(source, use.caller)
         start, end = text.span(use.call.func, True)
-        edits += [text.replace(start, start, f"{PACKAGE}.unweighted("), text.replace(end, end, ")")]
+        edits.append(text.replace(start, end, f"{PACKAGE}.unweighted({text.between(start, end)})"))
     if not (is_imported or in_place):
         edits.append(_import(Text(source, module.top)))
     edits.sort()

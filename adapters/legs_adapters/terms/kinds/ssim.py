@@ -44,8 +44,9 @@ class Ssim(Form):
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace the function; the further arguments are the defaults of ``legs_loss.ssim``, and are dropped."""
-        edits = [text.replace(*text.span(self.call.func, True), f"{PACKAGE}.ssim")]
-        if self.extras:
-            start, end = text.span(self.call.args[1])[1], text.span(self.call.args[-1])[1]
-            edits.append(text.replace(start, end, residue(text.between(start, end))))
-        return edits
+        function, call = text.span(self.call.func, True), text.span(self.call)
+        second, last = (text.span(self.call.args[at])[1] for at in (1, -1))
+        arguments = (
+            text.between(function[1], second) + residue(text.between(second, last)) + text.between(last, call[1])
+        )
+        return [text.replace(function[0], call[1], f"{PACKAGE}.ssim{arguments}")]

@@ -7,9 +7,7 @@ names only files that legs-patch writes. What is read and what is about to be wr
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
-import re
 import zlib
 from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence
@@ -18,24 +16,26 @@ from legs_adapters.checkout.replace import MAX_FILE_BYTES, read_file
 from legs_adapters.code.folders import check_name
 from legs_adapters.code.limits import MAX_BYTES
 from legs_adapters.settings import SETTINGS_FILE
-from legs_adapters.terms.text import Edit
+from legs_adapters.terms.text import Edit, apply_edits
 from legs_adapters.terms.writing import PACKAGE
 from legs_loss import LegsError
 
 JOURNAL = ".legs-patch.json"
-MAX_EDITS, MAX_LAYERS = 100_000, 100  # of the journal, and patches of one file
-_VERSION = 1
+MAX_EDITS, MAX_LAYERS = 100_000, 100  # of a file's patch, and patches of one file
+_VERSION = 2
 _NOTE = "What legs-patch changed here, and the bytes from before. legs-patch --undo needs it; do not edit it."
-_ESCAPED, _QUOTED = re.compile(rb"\\.", re.S), re.compile(rb'"[^"]*"')
-_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 class Layer(NamedTuple):
-    """One patch of one file: its bytes before, the edits in order, and the checksum of the bytes after."""
+    """One patch of one file: its bytes before, and the edits in order."""
 
     original: bytes
     edits: Sequence[Edit]
-    after: str
+
+    @property
+    def patched(self) -> bytes:
+        """Its bytes after."""
+        return apply_edits(self.original, self.edits)
 
 
 class Journal(NamedTuple):
@@ -43,12 +43,12 @@ class Journal(NamedTuple):
 
     Attributes:
         files: for each patched path its layers, the oldest first.
-        created: files that a patch created, with the checksums of what it wrote, and of what it wrote before.
+        created: files that a patch created, with what it wrote, and with what it wrote before.
         data: the file's bytes as they were read; None where there was no journal.
     """
 
     files: Dict[str, List[Layer]]
-    created: Dict[str, List[str]]
+    created: Dict[str, List[bytes]]
     data: Optional[bytes] = None
 
     @classmethod
@@ -70,14 +70,14 @@ class Journal(NamedTuple):
         try:
             if len(data) > MAX_FILE_BYTES:
                 raise ValueError(f"larger than {MAX_FILE_BYTES >> 20} MiB")
-            outside = _QUOTED.sub(b"", _ESCAPED.sub(b"", data))  # before any of it is an object in memory
-            if outside.count(b"[") + outside.count(b"{") > MAX_EDITS:
-                raise ValueError(f"more than {MAX_EDITS} edits")
             content = json.loads(data.decode("utf-8"))
             if content["version"] != _VERSION:
                 raise ValueError("written by another version of legs-patch: undo with that version")
             files = _read_files(content["files"])
-            created = {_only(name, name == SETTINGS_FILE): _checksums(at) for name, at in content["created"].items()}
+            created = {name: [text.encode("utf-8") for text in texts] for name, texts in content["created"].items()}
+            odd = [name for name in files if not name.endswith(".py")] + [*{*created} - {SETTINGS_FILE}]
+            if odd:
+                raise ValueError(f"{odd[0]!r} is not a Python file or {SETTINGS_FILE}, and legs-patch writes no others")
         except (ValueError, TypeError, LookupError, AttributeError, RecursionError, zlib.error) as error:
             raise LegsError(f"{problem} ({error}){advice}") from None
         return cls(files, created, data)
@@ -96,7 +96,8 @@ class Journal(NamedTuple):
             LegsError: it would be refused where it is read.
         """
         files = {path: [_written(layer) for layer in layers] for path, layers in sorted(self.files.items())}
-        content: Dict[str, Any] = {"note": _NOTE, "version": _VERSION, "files": files, "created": self.created}
+        created = {path: [text.decode("utf-8") for text in texts] for path, texts in self.created.items()}
+        content: Dict[str, Any] = {"note": _NOTE, "version": _VERSION, "files": files, "created": created}
         data = (json.dumps(content, indent=1) + "\n").encode("utf-8")
         advice = "undo the earlier patches first, or leave large files out by --exclude"
         self._parsed(data, f"{JOURNAL} could not be read again", f", so nothing was written: {advice}")
@@ -105,18 +106,12 @@ class Journal(NamedTuple):
     def is_as_written(self, path: str, data: bytes) -> bool:
         """Return whether a file's bytes are as the patch left them."""
         layers = self.files.get(path)
-        return digest(data) in ([layers[-1].after] if layers else self.created.get(path, ()))
-
-
-def digest(data: bytes) -> str:
-    """Return the checksum that the journal keeps of a file."""
-    return hashlib.sha256(data).hexdigest()
+        return data == layers[-1].patched if layers else data in self.created.get(path, ())
 
 
 def _written(layer: Layer) -> Dict[str, Any]:
     edits = [(edit.start, edit.end, edit.after.decode("utf-8")) for edit in layer.edits]
-    original = base64.b64encode(zlib.compress(layer.original, 9)).decode("ascii")
-    return {"after": layer.after, "edits": edits, "original": original}
+    return {"edits": edits, "original": base64.b64encode(zlib.compress(layer.original, 9)).decode("ascii")}
 
 
 def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:
@@ -124,9 +119,9 @@ def _read_files(content: Dict[str, Any]) -> Dict[str, List[Layer]]:
     room = MAX_BYTES
     for name, layers in content.items():
         check_name(name)
-        files[_only(name, name.endswith(".py"))] = []
         if len(layers) > MAX_LAYERS:
             raise ValueError(f"more than {MAX_LAYERS} patches of {name}")
+        files[name] = []
         for layer in layers:
             files[name].append(_read_layer(layer, room))
             room -= len(files[name][-1].original)
@@ -139,6 +134,8 @@ def _read_layer(content: Dict[str, Any], room: int) -> Layer:
     original = stream.decompress(base64.b64decode(content["original"], validate=True), room + 1)
     if len(original) > room or not stream.eof:
         raise ValueError(f"a file is cut off, or all are larger than {MAX_BYTES >> 20} MiB")
+    if len(content["edits"]) > MAX_EDITS:
+        raise ValueError(f"more than {MAX_EDITS} edits")
     edits: List[Edit] = []
     at = 0
     for start, end, text in sorted(content["edits"]):
@@ -146,20 +143,4 @@ def _read_layer(content: Dict[str, Any], room: int) -> Layer:
             raise ValueError(f"an edit of bytes {start!r} to {end!r} of {len(original)}")
         edits.append(Edit(start, end, text.encode("utf-8")))
         at = end
-    return Layer(original, edits, _checksum(content["after"]))
-
-
-def _only(name: str, is_written: bool) -> str:
-    if not is_written:
-        raise ValueError(f"{name!r} is not a Python file or {SETTINGS_FILE}, and legs-patch writes no others")
-    return name
-
-
-def _checksums(value: Any) -> List[str]:
-    return [_checksum(each) for each in (value[-2:] if isinstance(value, list) else [value])]
-
-
-def _checksum(value: Any) -> str:
-    if not isinstance(value, str) or not _DIGEST.fullmatch(value):
-        raise ValueError("an invalid checksum")
-    return value
+    return Layer(original, edits)

@@ -14,7 +14,7 @@ from legs_adapters.checkout.replace import Changes, locked, read_file, replace_f
 from legs_adapters.code.folders import first_of, why_left_out
 from legs_adapters.code.sources import Unreadable, check_root, read_files
 from legs_adapters.edit import rewrite
-from legs_adapters.journal import JOURNAL, Journal, Layer, digest
+from legs_adapters.journal import JOURNAL, Journal, Layer
 from legs_adapters.rules.find import find
 from legs_adapters.settings import SETTINGS_FILE
 from legs_adapters.terms.findings import Findings
@@ -168,8 +168,7 @@ def write(plan: Plan, force: bool = False) -> List[str]:
             current = changes[SETTINGS_FILE][0]
             if current is not None and not journal.is_as_written(SETTINGS_FILE, current):
                 raise LegsError(f"{SETTINGS_FILE} exists and is not as legs-patch wrote it: change the settings in it")
-            known = [] if current is None else [digest(current)]
-            journal.created[SETTINGS_FILE] = [*known, digest(plan.settings.encode("utf-8"))]
+            journal.created[SETTINGS_FILE] = [*filter(None, [current]), plan.settings.encode("utf-8")]
         if not changes:
             return []
         own = {path: plan.source(path) for path in plan.after if not journal.is_as_written(path, plan.source(path))}
@@ -177,8 +176,8 @@ def write(plan: Plan, force: bool = False) -> List[str]:
         if changed:
             files = first_of(changed, 5)
             raise LegsError(f"uncommitted changes in what would be patched ({files}): commit them, or use --force")
-        for path, data in plan.after.items():
-            journal.add(path, Layer(plan.source(path), plan.edits[path], digest(data)))
+        for path in plan.after:
+            journal.add(path, Layer(plan.source(path), plan.edits[path]))
         # The journal is written first, so that --undo works whatever happens next.
         replace_files(root, {JOURNAL: (journal.data, journal.dump()), **changes}, stop)
     return list(changes)

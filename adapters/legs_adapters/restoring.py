@@ -13,7 +13,6 @@ from legs_adapters.code.folders import first_of
 from legs_adapters.code.limits import STRING, Budget
 from legs_adapters.edit import why_not_compiled
 from legs_adapters.journal import Layer
-from legs_adapters.terms.text import apply_edits
 from legs_adapters.terms.writing import PACKAGE
 
 _TOKEN = re.compile(rf"#[^\r\n]*|\w*(?:{STRING})|\w+|[^\w\s\\]".encode(), re.S)
@@ -34,7 +33,7 @@ def restored(name: str, layer: Layer, data: bytes, budget: Budget) -> Tuple[byte
     Returns:
         The file's bytes; and "", or why they are those of now: what is weighted still, and the lines from before.
     """
-    patched = apply_edits(layer.original, layer.edits)
+    patched = layer.patched
     wrote: Dict[Tuple[int, int], bytes] = {}  # by its place in the patched file what stood there before
     shift = 0
     for edit in layer.edits:

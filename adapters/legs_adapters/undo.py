@@ -11,7 +11,7 @@ from legs_adapters.checkout.replace import Changes, locked, read_file, replace_f
 from legs_adapters.code.folders import first_of, walk
 from legs_adapters.code.limits import Budget
 from legs_adapters.code.sources import Source, check_root, read_source
-from legs_adapters.journal import JOURNAL, Journal, digest
+from legs_adapters.journal import JOURNAL, Journal
 from legs_adapters.restoring import restored, weighted_lines
 from legs_adapters.terms.writing import PACKAGE
 from legs_loss import LegsError
@@ -85,7 +85,7 @@ def _undone(root: Path, journal: Journal, force: bool) -> _Undone:
             kept.append((name, f"the file is gone: {why}"))
             continue
         for layer in reversed(layers):
-            if digest(data) == layer.after:
+            if data == layer.patched:
                 data = layer.original
             elif data not in (earlier.original for earlier in layers):  # else it is as before: git took it back
                 edited.append(name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import io
 import json
 import os
@@ -29,21 +28,17 @@ def pack(data):
     return base64.b64encode(zlib.compress(data)).decode()
 
 
-def digest(data):
-    return hashlib.sha256(data).hexdigest()
-
-
 def journal(written, created=()):
     """Return a journal that would put the second bytes where the first are, and delete files with the bytes created."""
     return json.dumps(
         {
-            "version": 1,
+            "version": 2,
             "note": "",
             "files": {
-                name: [{"after": digest(now), "edits": [], "original": pack(put)}]
+                name: [{"edits": [[0, len(put), now.decode()]], "original": pack(put)}]
                 for name, (now, put) in dict(written).items()
             },
-            "created": {name: digest(now) for name, now in dict(created).items()},
+            "created": {name: [now.decode()] for name, now in dict(created).items()},
         }
     )
 
@@ -162,8 +157,8 @@ def test_a_moved_checkout_is_undone(how, attack):
 
 def layers(*contents):
     """Return a journal of one file with these layers, each a change of a good one."""
-    good = {"original": pack(b"x"), "edits": [], "after": "0" * 64}
-    return json.dumps({"version": 1, "files": {"a.py": [{**good, **change} for change in contents]}, "created": {}})
+    good = {"original": pack(b"x"), "edits": []}
+    return json.dumps({"version": 2, "files": {"a.py": [{**good, **change} for change in contents]}, "created": {}})
 
 
 # The large ones are made by their tests alone.
@@ -176,10 +171,10 @@ DAMAGED = {
     "a list": "[]",
     "no version": "{}",
     "another version": '{"version": 7}',
-    "no files": '{"version": 1}',
-    "files are a list": '{"version": 1, "files": [], "created": {}}',
-    "layers are a number": '{"version": 1, "files": {"a.py": 3}, "created": {}}',
-    "a layer is a number": '{"version": 1, "files": {"a.py": [3]}, "created": {}}',
+    "no files": '{"version": 2}',
+    "files are a list": '{"version": 2, "files": [], "created": {}}',
+    "layers are a number": '{"version": 2, "files": {"a.py": 3}, "created": {}}',
+    "a layer is a number": '{"version": 2, "files": {"a.py": [3]}, "created": {}}',
     "no base64": layers({"original": "%"}),
     "not compressed": layers({"original": "AAAA"}),
     "truncated": layers({"original": pack(b"hello" * 100)[:12]}),
@@ -191,7 +186,9 @@ DAMAGED = {
     "edits of numbers": layers({"edits": [[0, 1, 7]]}),
     "edits over one another": layers({"edits": [[0, 1, ""], [0, 1, ""]]}),
     "60,000 patches of a file": lambda: layers(*[{}] * 60_000),
-    "no checksum": layers({"after": "z"}),
+    "created by a number": '{"version": 2, "files": {}, "created": {"legs.toml": 3}}',
+    "created with halves": '{"version": 2, "files": {}, "created": {"legs.toml": ["\\ud800"]}}',
+    "another file created": '{"version": 2, "files": {}, "created": {"a/legs.toml": []}}',
     "a million edits": lambda: layers(
         {"original": pack(b"x" * (1 << 20)), "edits": [[i, i, "y"] for i in range(1 << 19)]}
     ),

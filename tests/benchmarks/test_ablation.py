@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any, Dict, List, Tuple
@@ -16,6 +15,7 @@ if not hasattr(os, "fork"):
     pytest.skip("no os.fork", allow_module_level=True)
 
 from benchmarks import ablation
+from tests import preloaded
 from tests.benchmarks.test_corpus import run, trees
 from tests.support import legs_environment
 
@@ -30,11 +30,8 @@ def places(*given: Tuple[str, int]) -> List[Dict[str, Any]]:
 
 
 def in_a_new_process(code: str, *arguments: str) -> Any:
-    environment = dict(legs_environment())
-    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), environment["PYTHONPATH"]])
     command = [sys.executable, "-c", f"import json, sys; from benchmarks import ablation\n{code}", *arguments]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
+    return json.loads(preloaded.run(command, cwd=str(ROOT), env=legs_environment(), check=True).stdout)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -15,6 +14,7 @@ import pytest
 pytest.importorskip("libcst")
 
 from benchmarks import corpus
+from tests import preloaded
 from tests.patcher.support import checkout
 from tests.support import legs_environment
 
@@ -48,10 +48,8 @@ def trees(tmp_path: Path) -> Path:
 
 
 def run(*arguments: Any) -> subprocess.CompletedProcess[str]:
-    environment = dict(legs_environment())
-    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), environment["PYTHONPATH"]])
     command = [sys.executable, "-m", "benchmarks.corpus", *map(str, arguments)]
-    return subprocess.run(command, cwd=str(ROOT), env=environment, capture_output=True, text=True)
+    return preloaded.run(command, cwd=str(ROOT), env=legs_environment())
 
 
 def contents(folder: Path) -> Dict[str, bytes]:

@@ -24,6 +24,7 @@ from benchmarks.gpu.__main__ import MINUTES
 from benchmarks.gpu.options import ROOT, Options, Skipped
 from benchmarks.gpu.stages import CERTAIN, STAGES
 from benchmarks.losses import timing
+from tests import preloaded
 from tests.cuda_emulation import COMPILER
 from tests.lab.experiments.miniature import RENDER, RENDERER, TRAIN
 from tests.support import legs_environment
@@ -36,15 +37,11 @@ def command(*arguments: Any) -> list[str]:
 
 
 def environment(**settings: str) -> dict[str, str]:
-    found = dict(legs_environment(), **settings)
-    found["PYTHONPATH"] = os.pathsep.join([str(ROOT), found["PYTHONPATH"]])
-    return found
+    return dict(legs_environment(), **settings)
 
 
 def run(*arguments: Any, **settings: str) -> Any:
-    return subprocess.run(
-        command(*arguments), cwd=str(ROOT), env=environment(**settings), capture_output=True, text=True
-    )
+    return preloaded.run(command(*arguments), cwd=str(ROOT), env=environment(**settings), timeout=1500)
 
 
 def codebase(root: Path, scene: Path) -> Path:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ pytest.importorskip("numba")
 
 from benchmarks.losses import timing
 from benchmarks.losses.tables import at_bandwidth
+from tests import preloaded
 from tests.support import legs_environment
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,10 +22,8 @@ NAMES = ["LEGS, weights in the kernel", "LEGS, stored map", "3DGS (torch)"]
 
 
 def run(*arguments: str, **settings: str) -> Any:
-    environment = dict(legs_environment(), **settings)
-    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), environment["PYTHONPATH"]])
     command = [sys.executable, "benchmarks/loss.py", *arguments]
-    return subprocess.run(command, cwd=str(ROOT), env=environment, capture_output=True, text=True)
+    return preloaded.run(command, cwd=str(ROOT), env=dict(legs_environment(), **settings), timeout=1500)
 
 
 @pytest.mark.slow

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 from benchmarks import fuzz
+from tests.preloaded import run
 from tests.support import legs_environment
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_few_cases_of_every_reader(tmp_path):
-    environment = legs_environment()
-    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), environment["PYTHONPATH"]])
     cases = 10 * len(fuzz.READERS)
-    command = [sys.executable, "-W", "ignore", "-m", "benchmarks.fuzz", "--cases", str(cases), "--seed", "3"]
-    done = subprocess.run(
-        [*command, "--keep", str(tmp_path)], cwd=str(ROOT), env=environment, capture_output=True, text=True, timeout=600
-    )
+    command = [sys.executable, "-m", "benchmarks.fuzz", "--cases", str(cases), "--seed", "3", "--keep", str(tmp_path)]
+    done = run(command, cwd=str(ROOT), env=legs_environment(), timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     each = ", ".join(f"{name} 10" for name in fuzz.READERS)
     assert done.stdout == f"seed 3: {cases} cases, 0 failed; {each}\n"

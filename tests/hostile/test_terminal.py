@@ -60,7 +60,7 @@ def test_a_long_reading_says_on_a_terminal_how_far_it_is(tmp_path):
     train = files("inria")["train.py"]
     root = checkout(tmp_path, {**files("inria"), **{f"other{i}/train.py": train for i in range(14)}})
     command = [sys.executable, "-c", SLOWLY, str(root)]
-    quiet = subprocess.run(command, capture_output=True, env=legs_environment(), timeout=300)
+    quiet = run(command, env=legs_environment(), text=False)
     assert quiet.returncode == 1 and b"files read" not in quiet.stdout + quiet.stderr
 
     outer, inner = pty.openpty()

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import Any, Dict, Iterator, List, NamedTuple, Sequence, Tuple
 
-from legs_adapters.code.folders import SUBMODULE, VENDORED, folders_of
+from legs_adapters.code.folders import LINK, SUBMODULE, VENDORED, WORKTREE, folders_of
 from legs_adapters.code.limits import Budget
 from legs_adapters.code.sources import Source, read_files
 from legs_adapters.lexicon.words import SPLATS
@@ -16,7 +16,10 @@ from legs_loss import LegsError
 
 
 class Unsearched(NamedTuple):
-    """A codebase that is not searched, with the first line in it that may be the loss; relative to the root."""
+    """A codebase that is not searched, with the first line in it that may be the loss; relative to the root.
+
+    Of a link, which is not followed, the folder and line 0.
+    """
 
     folder: str
     why: str
@@ -25,14 +28,17 @@ class Unsearched(NamedTuple):
 
     def text(self, root: object) -> str:
         """Return what to run there."""
-        where = f"{self.path}:{self.line} may be the loss"
+        where = f"{self.path}:{self.line} may be the loss, and" if self.line else "there is code there, and"
         command = f"legs-patch {shlex.quote(f'{root}/{self.folder}')}"
-        return f"{where}, and {self.folder} is not searched ({self.why}): {command}"
+        return f"{where} {self.folder} is not searched ({self.why}): {command}"
 
 
 def unsearched(root: Path, budget: Budget, exclude: Sequence[str] = ()) -> Iterator[Unsearched]:
-    """Yield the submodules and the folders of third-party code that draw Gaussians and have a term of their own."""
+    """Yield the folders that are other codebases, draw Gaussians and have a term of their own; and links to code."""
     for folder, why in sorted(_skipped(root, "", exclude)):
+        if why == LINK:
+            yield Unsearched(folder, why, folder, 0)
+            continue
         by_codebase: Dict[str, List[Source]] = {}
         try:
             sources = read_files(root / folder, exclude)[0]
@@ -52,7 +58,7 @@ def unsearched(root: Path, budget: Budget, exclude: Sequence[str] = ()) -> Itera
 def _skipped(root: Path, below: str, exclude: Sequence[str]) -> Iterator[Tuple[str, str]]:
     """Yield the folders below one that are not searched, and those in them, each with the reason."""
     skipped = [folder for _, inner in folders_of(root / below, exclude) for folder in inner]
-    for path, why in [each for each in skipped if each.why in (SUBMODULE, VENDORED)]:
+    for path, why in [each for each in skipped if each.why in (SUBMODULE, VENDORED, WORKTREE, LINK)]:
         path = f"{below}/{path}".lstrip("/")
         yield path, why
-        yield from _skipped(root, path, exclude)
+        yield from () if why == LINK else _skipped(root, path, exclude)

@@ -308,6 +308,39 @@ class TestCommandLine:
         assert run(root, "--check", "--exclude", "sub", "--exclude", "third_party").stderr == ""
         assert run(root / "sub" / "gs").returncode == 0
 
+    def test_a_link_to_code_outside_and_another_worktree_are_said(self, tmp_path, run):
+        texts = {path: without_marks(text) for path, text in files("inria").items()}
+        other, root = checkout(tmp_path / "other", texts), checkout(tmp_path / "own", texts, git=True)
+        os.symlink(str(other), str(root / "methods"))  # ln -s ../FasterGS
+        for name, to in (
+            ("inside", "utils"),
+            ("data", os.devnull),
+            ("self", "."),
+            ("nothing", "nowhere"),
+            ("top", "/"),
+        ):
+            os.symlink(to, str(root / name))
+        run_git(root, "worktree", "add", "-q", "branch", "HEAD")
+        line = texts["train.py"].splitlines().index(SITE.rstrip("\n")) + 1
+        done = run(root, "--json")
+        why = ["another worktree of this checkout", "a link"]
+        what = {"branch": f"branch/train.py:{line} may be the loss", "methods": "there is code there"}
+        assert done.stderr.splitlines() == [
+            f"legs-patch: warning: {said}, and {name} is not searched ({why.pop(0)}): legs-patch {root}/{name}"
+            for name, said in what.items()
+        ]
+        report = json.loads(done.stdout)
+        where = [(each["file"], each["line"]) for each in report["unsearched"]]
+        assert where == [("branch/train.py", line), ("methods", 0)]
+        assert report["wrote"] and {path.split("/")[0] for path in report["wrote"]}.isdisjoint({"methods", "branch"})
+        assert (other / "train.py").read_text() == texts["train.py"]
+        alone = checkout(tmp_path / "alone", {"run.py": "import os\n"})
+        os.symlink(str(other), str(alone / "methods"))
+        refused = run(alone)
+        assert refused.returncode == 2
+        assert "not searched: methods (a link): run legs-patch on the one that trains" in refused.stderr
+        assert run(alone / "methods").returncode == 0
+
     def test_a_skipped_line_that_speaks_of_images_is_offered_where_nothing_was_found(self, tmp_path, run):
         step = "def train_texture(image, gt_image):\n    l1_loss(image.depth, gt_image.depth).backward()\n"
         done = run(checkout(tmp_path, {"a.py": "from gaussian_renderer import render\n\n\n" + step}))

@@ -13,7 +13,7 @@ from legs_loss import LegsError
 from legs_loss.system.files import read_regular
 
 VENDORED, SUBMODULE = "third-party code", "a submodule"
-_TESTS, _WORKTREE = "a folder of tests", "another worktree of this checkout"
+WORKTREE, LINK, _TESTS = "another worktree of this checkout", "a link", "a folder of tests"
 CLOSED = "cannot be read: Permission denied"
 _FOREIGN = {
     name: why
@@ -29,7 +29,7 @@ _FOREIGN = {
     )
     for name in names.split()
 }
-PATCHABLE = (VENDORED, _TESTS, SUBMODULE, _WORKTREE)
+PATCHABLE = (VENDORED, _TESTS, SUBMODULE, WORKTREE, LINK)
 _LARGEST = 1 << 20  # bytes of a .gitmodules, or of a .git that is a file
 _TEST_FILE = re.compile(r"^(test_.*|conftest)\.py$")
 
@@ -68,7 +68,7 @@ def foreign_folder(root: Path, path: str) -> Optional[Skipped]:
     submodules = _submodules(root, "")
     folders = [folder.as_posix() for folder in reversed(PurePosixPath(path).parents)][1:]
     for folder, inner in zip(folders, [*folders[1:], ""]):
-        why = "a link" if os.path.islink(str(root / folder)) else _why_foreign(root, folder, submodules)
+        why = LINK if os.path.islink(str(root / folder)) else _why_foreign(root, folder, submodules)
         submodules |= _submodules(root, folder)
         if why == VENDORED and inner:
             return Skipped(inner, _why_foreign(root, inner, submodules) or why)
@@ -86,12 +86,23 @@ def folders_of(
         relative = Path(here).relative_to(root)
         submodules |= _submodules(root, relative.as_posix()) if ".gitmodules" in names else set()
         paths = {(relative / name).as_posix(): name for name in sorted([*folders, *names])}
-        own = [path for path in paths if not _excluded(path, exclude) and not os.path.islink(str(root / path))]
+        named = [path for path in paths if not _excluded(path, exclude)]
+        own = [path for path in named if not os.path.islink(str(root / path))]
         why = {path: _why_foreign(root, path, submodules) for path in own if paths[path] in folders}
         folders[:] = [paths[path] for path, reason in why.items() if reason is None]
         files = [path for path in own if path.endswith(ends) and not _TEST_FILE.match(paths[path])]
         regular = [path for path in files if path not in why and os.path.isfile(str(root / path))]
-        yield regular, [Skipped(path, reason) for path, reason in why.items() if reason is not None]
+        links = [Skipped(path, LINK) for path in named if path not in own and _leads_to_code(root, path)]
+        yield regular, links + [Skipped(path, reason) for path, reason in why.items() if reason is not None]
+
+
+def _leads_to_code(root: Path, path: str) -> bool:
+    """Return whether a link leads to a folder of code outside of the root. Names are looked at there, and no file."""
+    try:
+        names, target = os.listdir(str(root / path)), (root / path).resolve()
+    except (OSError, RuntimeError):  # to nothing, to a file, or to itself
+        return False
+    return root not in (target, *target.parents) and any(name == ".git" or name.endswith(".py") for name in names)
 
 
 def _why_foreign(root: Path, path: str, submodules: Set[str]) -> Optional[str]:
@@ -115,7 +126,7 @@ def _why_not_own(folder: Path) -> Optional[str]:
     kept = Path(os.path.normpath(str(folder / text.partition("gitdir:")[2].strip())))
     inside = kept.parts[kept.parts.index(".git") :] if ".git" in kept.parts else ()
     outer = any(above / ".git" in kept.parents for above in folder.parents)
-    return SUBMODULE if "modules" in inside else _WORKTREE if outer else None
+    return SUBMODULE if "modules" in inside else WORKTREE if outer else None
 
 
 def _excluded(path: str, patterns: Sequence[str]) -> bool:

@@ -34,6 +34,7 @@ from legs_adapters.tensors.operations import (
     JOINS,
     KEEPS_PICTURES,
     LEARNED,
+    LOGARITHMS,
     MODULES,
     NUMBERS,
     PICTURE_FUNCTIONS,
@@ -130,6 +131,15 @@ def _moved(call: CallReading) -> Optional[Meaning]:
     return call.ask(call.values[0]) if is_function and call.values else None
 
 
+def _on_another_scale(call: CallReading) -> Optional[Meaning]:
+    """The logarithm of a picture, or what has it as its logarithm."""
+    of = call.owner or next(iter(call.positional), None)
+    if call.name not in LOGARITHMS or of is None:
+        return None
+    meaning = call.ask(of)
+    return meaning._replace(kind="logarithm") if meaning.kind == "image" else meaning
+
+
 def picked_from(call: cst.Call, index: int = 0) -> int:
     """Return the channel at which a part of a picture begins, ``x.narrow(0, 3, 1)``, ``x.split([3, 1])[1]``; or 0."""
     given = [constant(arg.value) for arg in call.args]
@@ -191,8 +201,8 @@ def _of_images(call: CallReading) -> Optional[Meaning]:
     bodies = [returned(target) for target in (each.target for each in references) if isinstance(target, Function)]
     changes = any(is_of_neighbours(part) for body in bodies if body is not None for part in attribute_chain(body))
     made, of = meaning_returned(call) or UNKNOWN, mix(images)
-    is_feature = made.kind == "feature" and made.role in ("target", "both")
-    return of._replace(kind="gradient" if changes else "feature" if is_feature else of.kind)
+    is_other = made.kind == "logarithm" or (made.kind == "feature" and made.role in ("target", "both"))
+    return of._replace(kind="gradient" if changes else made.kind if is_other else of.kind)
 
 
 def is_of_neighbours(
@@ -232,4 +242,4 @@ def _of_owner(call: CallReading) -> Optional[Meaning]:
     return Meaning(kind, call.ask(call.owner).role if kind and call.owner is not None else None)
 
 
-_SURE = (_number, _reduced, _filtered, _moved, _keyed, _rendered, _named)
+_SURE = (_number, _reduced, _filtered, _moved, _on_another_scale, _keyed, _rendered, _named)

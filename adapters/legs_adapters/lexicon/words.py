@@ -53,6 +53,7 @@ WORDS = {
         vertices verts bone bones smpl center centers knn kpt kpts keypoint keypoints mu std base precomp radii
         timestamp timestamps
     """,
+    "logarithm": "",  # by an operation; no name says so
     "image": """
         image images img imgs im ims rgb rgbs rgba color colors colour colours render renders rendered rendering
         renderings pixel pixels photo photos picture pbr comp frame frames thermal thermals
@@ -130,5 +131,5 @@ OF_RAYS = re.compile(r"(\b|_)(rays?|nerf|neus)(_|\b)", re.I)
 STRUCTURAL = re.compile("ssim", re.I)
 NO_L1 = re.compile(r"ssim|lpips|vgg|percept|psnr|mse|l2|huber|smooth_?l1|charbonnier|cross_?entropy|cosine", re.I)
 # A text is searched ten times as fast where a pattern begins with a letter: what may stand before it is asked after it.
-SPEAKS_OF_L1 = re.compile(r"[lL]1|abs(?<!\wabs)(?<!np\.abs)(?<!numpy\.abs)(?<!math\.abs)(?:olute)?\s*\(")
+SPEAKS_OF_L1 = re.compile(r"[lL]1|abs(?<!\wabs)(?<!np\.abs)(?<!numpy\.abs)(?<!math\.abs)(?:olute)?_?\s*\(")
 SPEAKS_OF_LOSS = re.compile(r"l1|mae|loss|photo|color|rgb|abs", re.I)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Optional
+from typing import NamedTuple, Optional, Tuple
 
 import libcst as cst
 
@@ -26,20 +26,27 @@ def absolute_value(node: cst.Call) -> Optional[AbsoluteValue]:
     return None if argument is None else AbsoluteValue(call, argument, "none" if call is node else "mean")
 
 
-def is_difference(node: Optional[cst.CSTNode]) -> bool:
-    """Return whether an expression is ``a - b``; None is none."""
-    return isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Subtract)
+def sides_of(node: Optional[cst.CSTNode]) -> Optional[Tuple[cst.BaseExpression, cst.BaseExpression]]:
+    """Return the two sides of a difference, ``a - b``, ``torch.sub(a, b)``, ``a.sub(b)``; None of anything else."""
+    if isinstance(node, cst.BinaryOperation):
+        return (node.left, node.right) if isinstance(node.operator, cst.Subtract) else None
+    if not isinstance(node, cst.Call) or call_name(node) not in ("sub", "subtract"):
+        return None
+    owner = node.func.value if isinstance(node.func, cst.Attribute) else None
+    sides = ([owner] if owner is not None and len(node.args) == 1 else []) + [arg.value for arg in node.args]
+    is_plain = len(sides) == 2 and not any(arg.star or arg.keyword for arg in node.args)
+    return (sides[0], sides[1]) if is_plain else None
 
 
 def is_no_picture(node: cst.CSTNode) -> bool:
     """Return whether an expression is ``abs(a - b)``, or one value for every pixel: ``torch.zeros_like(a)``."""
     is_constant = isinstance(node, cst.Call) and call_name(node) in CONSTANTS
-    return is_constant or is_difference(abs_argument(node))
+    return is_constant or sides_of(abs_argument(node)) is not None
 
 
 def abs_argument(node: cst.CSTNode) -> Optional[cst.BaseExpression]:
     """Return the argument of an absolute value, ``abs(x)``, ``torch.abs(x)``, ``x.abs()``; None for any other node."""
-    return _argument(node, "abs", "absolute")
+    return _argument(node, "abs", "absolute", "abs_", "absolute_")
 
 
 def _argument(node: cst.CSTNode, *names: str) -> Optional[cst.BaseExpression]:

@@ -43,9 +43,8 @@ NO_GRAD = word_set("inference_mode no_grad")  # contexts and decorators
 BACKWARD = word_set("backward manual_backward")  # the second is Lightning's
 LOSSES = word_set("loss outputs tensors")  # the keywords of what they take the gradient of
 APPLIES = word_set("add_ copy_ step sub_")  # a parameter changes by what these are given
-TRANSFORMS = word_set(
-    "exp log log10 log1p log2 maximum minimum pow sigmoid sqrt square tanh"
-)  # no longer an absolute error
+LOGARITHMS = word_set("exp log log10 log1p log2")  # of a picture and back: its contours are others
+TRANSFORMS = LOGARITHMS | word_set("maximum minimum pow sigmoid sqrt square tanh")  # no longer an absolute error
 OTHER_LOSSES = word_set("huber_loss mse_loss norm smooth_l1_loss")
 MODULES = word_set("F TF einops functional nn np numpy torch")  # as torch and its neighbours are imported
 # Libraries whose operations make no other picture of one, but for the networks in them; and what hands on values.
@@ -65,7 +64,7 @@ OPTIMISERS = word_set("optimiser optimisers optimizer optimizers")
 STEPS = word_set("adam optim optimise optimize sgd step steps update")
 SCHEDULES = word_set("bar lr pbar profiler progress sched scheduler schedulers strategy tqdm")
 _PICKS = word_set("chunk index_select narrow select split unbind")
-_COMPUTES = word_set("add div div_ masked_fill mean mul mul_ pow sub sum")
+_COMPUTES = word_set("add div div_ masked_fill mean mul mul_ pow sum")
 _FILTERS = word_set("abs conv2d einsum gather masked_select relu sigmoid")
 _RESAMPLES = word_set("avg_pool2d center_crop crop gaussian_blur grid_sample interpolate max_pool2d pad resize")
 _PASSES_ON = word_set("DataLoader checkpoint enumerate iter list next no_grad reversed tqdm tuple zip")

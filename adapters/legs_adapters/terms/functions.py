@@ -22,7 +22,7 @@ from legs_adapters.code.syntax import (
 )
 from legs_adapters.lexicon.names import TORCH_L1, has_perceptual_name, is_l1_name
 from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
-from legs_adapters.tensors.absolute import abs_argument, absolute_value, is_difference
+from legs_adapters.tensors.absolute import abs_argument, absolute_value, sides_of
 from legs_adapters.tensors.operations import ASKS, LIKE, LIMITS, OTHER_LOSSES, SIZES, TRANSFORMS, TRANSPARENT, depends
 from legs_adapters.terms.prospects import Prospects
 from legs_adapters.terms.writing import PACKAGE
@@ -91,9 +91,9 @@ class L1Functions:
     def _shape_of(self, function: Function, node: cst.Call, depth: int) -> Optional[str]:
         """Return what a returned call makes of the two: "mean" or "none", None for anything else."""
         pair, found = function.parameters[:2], absolute_value(node)
-        if found is not None and isinstance(found.argument, cst.BinaryOperation) and is_difference(found.argument):
-            sides = {code(side).strip("() ") for side in (found.argument.left, found.argument.right)}
-            return found.makes if sides == set(pair) else None
+        sides = sides_of(found.argument) if found is not None else None
+        if found is not None and sides is not None:
+            return found.makes if {code(side).strip("() ") for side in sides} == set(pair) else None
         references = self.program.resolve(function, node.func)
         if [code(arg.value) for arg in node.args[:2]] != pair or len(references) != 1:
             return None
@@ -143,6 +143,9 @@ class L1Functions:
 
     def _may_have(self, body: _Body, node: cst.CSTNode) -> Optional[Sequence[cst.CSTNode]]:
         """Return the parts of a node in which it may have the two; None where the function is no L1."""
+        sides = sides_of(node)
+        if sides is not None and body.is_pair(*sides):
+            return self._in_difference(body, node, sides[0])
         if isinstance(node, cst.BinaryOperation):
             return self._in_operation(body, node)
         if isinstance(node, cst.Call):
@@ -155,15 +158,16 @@ class L1Functions:
             return None  # an entry of a dictionary: its parameter is no picture itself
         return []
 
+    def _in_difference(self, body: _Body, node: cst.CSTNode, side: cst.CSTNode) -> Optional[List[cst.CSTNode]]:
+        calls = [part for part in walk_expressions(side) if isinstance(part, cst.Call)]
+        if LIMITS & set(map(call_name, calls)):
+            return None  # a weighted difference would be cut off
+        made = [r for call in calls for r in self.program.resolve(body.function, call.func)]
+        return None if any(r.kind == "function" for r in made) else [node]  # edges(a) - edges(b)
+
     def _in_operation(self, body: _Body, node: cst.BinaryOperation) -> Optional[List[cst.CSTNode]]:
         if isinstance(node.operator, cst.Power) and depends(body.function, node.left, set(body.pairs[0])):
             return None
-        if is_difference(node) and body.is_pair(node.left, node.right):
-            calls = [part for part in walk_expressions(node.left) if isinstance(part, cst.Call)]
-            if LIMITS & set(map(call_name, calls)):
-                return None  # a weighted difference would be cut off
-            made = [r for call in calls for r in self.program.resolve(body.function, call.func)]
-            return None if any(r.kind == "function" for r in made) else [node]  # edges(a) - edges(b)
         return [node] if isinstance(node.operator, cst.Multiply) and constant(node.right, 1) == 0 else []
 
     def _in_call(self, body: _Body, node: cst.Call) -> Optional[List[cst.CSTNode]]:

@@ -8,7 +8,7 @@ from legs_adapters.code.syntax import words_in
 from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.lexicon.words import BACKGROUND, COLORS, KIND_OF
 from legs_adapters.rules.rule import Rule, Term
-from legs_adapters.tensors.absolute import is_difference, is_no_picture
+from legs_adapters.tensors.absolute import is_no_picture, sides_of
 from legs_adapters.terms.findings import Decider
 from legs_adapters.terms.sides import is_beside_ssim, same_root, speaks_of_images
 
@@ -43,8 +43,9 @@ class Unknown(Rule):
             named = {word for word in words_in(*term.sides) if KIND_OF.get(word) == "image"}
             pictures = not named or bool(named - COLORS) or is_beside_ssim(term.function, *term.sides)
         sure = swapped(pair.a, pair.b) is not None or all(map(speaks_of_images, (pair.first, pair.second)))
-        changes = same_root(term.form) or all(map(is_difference, term.sides))  # of two views, or of neighbours
+        changes = same_root(term.form) or all(map(sides_of, term.sides))  # of two views, or of neighbours
         changes = changes or any(map(is_no_picture, term.sides))  # the error of an error, of angles; darkness
+        changes = changes or "logarithm" in (pair.a.kind, pair.b.kind)  # contours of dark places
         backdrop = {pair.a.role, pair.b.role} == {"render", None} and BACKGROUND & words_in(term.target)
         return [] if pictures and sure and not (changes or backdrop) else term.here
 

@@ -8,7 +8,7 @@ from typing import List, Optional
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.tensors.absolute import absolute_value, is_difference
+from legs_adapters.tensors.absolute import absolute_value, sides_of
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.text import Edit, Text, residue
@@ -28,9 +28,8 @@ class Absolute(Form):
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
         """Find ``abs`` of a difference that is not of numbers."""
         found = absolute_value(call)
-        if found is None or not isinstance(found.argument, cst.BinaryOperation) or not is_difference(found.argument):
-            return None
-        return cls(call, found.call, found.argument.left, found.argument.right, makes=found.makes)
+        sides = sides_of(found.argument) if found is not None else None
+        return cls(call, found.call, *sides, makes=found.makes) if found is not None and sides is not None else None
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace what stands before, between and after the two sides, comments kept."""

@@ -8,7 +8,7 @@ from typing import Iterator, Optional
 import libcst as cst
 
 from legs_adapters.code.module import Function
-from legs_adapters.tensors.absolute import absolute_value, is_difference
+from legs_adapters.tensors.absolute import absolute_value, sides_of
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
 
@@ -27,21 +27,22 @@ class Indirect(Form):
         difference: the ``a - b``.
     """
 
-    difference: Optional[cst.BinaryOperation] = None
+    difference: Optional[cst.CSTNode] = None
 
     @classmethod
     def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
         """Find ``abs`` of what is made of a difference, in the expression or by its definitions."""
         found = absolute_value(call)
         made = next(_differences(function, found.argument, 0), None) if found is not None else None
-        if found is None or made is None:
+        sides = sides_of(made)
+        if found is None or sides is None:
             return None
-        return cls(call, found.call, made.left, made.right, makes=found.makes, difference=made)
+        return cls(call, found.call, *sides, makes=found.makes, difference=made)
 
 
-def _differences(function: Function, node: cst.CSTNode, depth: int) -> Iterator[cst.BinaryOperation]:
+def _differences(function: Function, node: cst.CSTNode, depth: int) -> Iterator[cst.CSTNode]:
     """Yield the differences that an expression is a multiple, a quotient or a part of."""
-    if isinstance(node, cst.BinaryOperation) and is_difference(node):
+    if sides_of(node):
         yield node
     elif isinstance(node, cst.BinaryOperation) and isinstance(node.operator, (cst.Multiply, cst.Divide)):
         yield from _differences(function, node.left, depth)

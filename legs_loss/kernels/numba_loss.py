@@ -12,10 +12,10 @@ from torch import Tensor
 
 from legs_loss.images import check_values
 from legs_loss.kernels.codes import CURVES
-from legs_loss.kernels.compiling import claimed, compiled, in_threads, part, said
+from legs_loss.kernels.compiling import claimed, compiled, in_threads, multiply_add, part, said
 from legs_loss.kernels.contract import Backend, PreparedLoss, Terms
 from legs_loss.kernels.numba_response import Images, extremes, operator_of
-from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles, error_row
+from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles
 from legs_loss.kernels.numba_weights import FORMULAS, WeightSource, weights_of_row
 from legs_loss.spec import WeightSpec
 
@@ -112,7 +112,7 @@ def all_strips(counter, tasks, images, source, scale, gradient, sums):  # type: 
         sums: float64 [B * strips]: the weighted absolute error of each strip is written.
     """
     strips, width = tasks // images.views, images.width
-    weights, errors = np.empty(width, np.float32), np.empty(width, np.float32)
+    weights, errors, unused = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     task = claimed(counter)
     while task < tasks:
         view, strip = task // strips, task % strips
@@ -121,10 +121,8 @@ def all_strips(counter, tasks, images, source, scale, gradient, sums):  # type: 
             weights_of_row(images, source, view, row, np.int64(0), width, weights)
             for channel in range(images.channels):
                 at = ((view * images.channels + channel) * images.height + row) * width
-                x, y = images.x[at : at + width], images.y[at : at + width]
-                error_row(x, y, weights, errors)
-                if gradient.size > 0:
-                    _gradient_row(x, y, weights, scale, gradient[at : at + width])
+                out = gradient[at : at + width] if gradient.size > 0 else unused
+                _error_row(images.x[at : at + width], images.y[at : at + width], weights, scale, errors, out)
         total = 0.0
         for j in range(width):
             total += errors[j]
@@ -133,6 +131,8 @@ def all_strips(counter, tasks, images, source, scale, gradient, sums):  # type: 
 
 
 @part(fastmath=False)
-def _gradient_row(x, y, weight, scale, out):  # type: ignore[no-untyped-def]
+def _error_row(x, y, weight, scale, sums, out):  # type: ignore[no-untyped-def]
+    """Add the weighted absolute errors of a row to the sums of its columns; write their gradient."""
     for j in range(x.size):
+        sums[j] = multiply_add(weight[j], abs(x[j] - y[j]), sums[j])
         out[j] = scale * weight[j] * (np.float32(x[j] > y[j]) - np.float32(x[j] < y[j]))

@@ -2,14 +2,14 @@
 
 Each task walks down a tile, some rows a step, and keeps only the rows that the window sees:
 
-    rows of x, y, x^2 + y^2, xy -> blurred along the row -> blurred across rows -> SSIM and its three slopes
-        -> blurred along the row -> blurred across rows -> gradient
+    rows of x, y, x^2 + y^2, xy -> blurred across rows -> blurred along the row -> SSIM and its three slopes
+        -> blurred across rows -> blurred along the row -> gradient
 
 SSIM needs the two variances only as their sum, so four blurs go in and three come back. The window is symmetric and
 the padding zero, so the blur is its own adjoint. The loops are plain: rows lie a constant pitch apart, so LLVM sees
-that what is written does not overlap what is read, and makes vectors as wide as the processor has. Sums are taken by
-column, which keeps their order whatever the width of a vector. (Vectors written down by hand took 0.88 of its time on
-Zen 5, one thread, 1297x840, at three times the code.)
+that what is written does not overlap what is read, and makes vectors as wide as the processor has. A row's columns are
+dealt to four planes, the fifth to the first again: so four windows along the row share their fourteen values, as four
+across rows do. Sums are taken by column, which keeps their order whatever the width of a vector.
 """
 
 from __future__ import annotations
@@ -29,12 +29,15 @@ _T0, _T1, _T2, _T3, _T4, _T5 = (np.float32(tap) for tap in _TAPS[: _REACH + 1])
 _LUMINANCE, _CONTRAST = np.float32(LUMINANCE_CONSTANT), np.float32(CONTRAST_CONSTANT)
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
-# A tile's inner size; it repeats ten rows and columns of its neighbours' work on each side.
-TILE_HEIGHT, TILE_WIDTH = 256, 272
 _HALO = 2 * _REACH
 _STEP = 16  # rows
-_GROUP = 4  # rows that are blurred across at once: a row is then loaded once for all four
-_PITCH = TILE_WIDTH + 32  # floats of a row: with both halos, in whole cache lines
+_GROUP = 4  # windows that share their values: rows of a group, and planes of a row
+_LINE = 16  # floats of a cache line: what is computed of a plane, a multiple of each vector's width
+_PLANE = 7 * _LINE
+_PITCH = _GROUP * _PLANE  # floats of a row
+_FIELD, _BLURRED = (_HALO + _STEP) * _PITCH, _STEP * _PITCH
+# A tile's inner size; it repeats ten rows and columns of its neighbours' work on each side.
+TILE_HEIGHT, TILE_WIDTH = 256, _PITCH - 2 * _HALO
 
 
 class Tile(NamedTuple):
@@ -52,20 +55,23 @@ class Tile(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """A task's memory, rows of _PITCH floats.
+    """A task's memory, rows of _PITCH floats; their columns are dealt to planes, but for plain and weights.
 
-    plain: a row of the four moments; the columns outside the image stay zero.
-    moments, slopes: four and three quantities, blurred along the row: the rows of this step, below the ten before them.
-    blurred: the four moments of a group of rows, blurred across rows; of the slopes three.
-    made: SSIM's three slopes and its values, a group of rows.
+    plain: a row of x, of y and of the gradient; of x and y the columns outside the image stay zero.
+    weights: of the tile's rows; zero beyond its columns.
+    fields: four moments, then three slopes: the rows of this step, below the ten before them.
+    across: the four moments of a step's rows, blurred across rows; of the slopes three.
+    along: a row of these, blurred along the row as well.
+    inside: 1 where SSIM's columns lie in the image, else 0; then a row of zeros.
     sums: column by column, the weighted absolute error and SSIM.
     """
 
     plain: np.ndarray
-    moments: np.ndarray
-    slopes: np.ndarray
-    blurred: np.ndarray
-    made: np.ndarray
+    weights: np.ndarray
+    fields: np.ndarray
+    across: np.ndarray
+    along: np.ndarray
+    inside: np.ndarray
     sums: np.ndarray
 
 
@@ -82,205 +88,206 @@ def all_tiles(counter, tasks, images, down, across, scales, source, gradient, su
         gradient: float32 [B * C * H * W], or empty.
         sums: float64 [B * down * across, 2], zeros: the weighted absolute error and SSIM of each tile are added.
     """
-    channels, height, width = images.channels, images.height, images.width
-    tile_width = (width + across - 1) // across
-    weights = np.empty((-(-height // down), tile_width), np.float32)
     rows = Rows(
-        np.empty((4, _PITCH), np.float32),
-        np.empty((4, (_HALO + _STEP) * _PITCH), np.float32),
-        np.empty((3, (_HALO + _STEP) * _PITCH), np.float32),
-        np.empty((4, _GROUP * _PITCH), np.float32),
-        np.empty((4, _GROUP * _PITCH), np.float32),
-        np.empty((2, _PITCH), np.float32),
+        np.empty(3 * _PITCH, np.float32),
+        np.empty((-(-images.height // down), _PITCH), np.float32),
+        np.zeros(7 * _FIELD, np.float32),
+        np.zeros(4 * _BLURRED + _LINE, np.float32),
+        np.zeros(4 * _PITCH + _LINE, np.float32),
+        np.empty(2 * _PITCH, np.float32),
+        np.empty(2 * _PITCH, np.float32),
     )
     task = claimed(counter)
     while task < tasks:
-        view, place = task // (down * across), task % (down * across)
-        top, bottom = height * (place // across) // down, height * (place // across + 1) // down
-        left = tile_width * (place % across)
-        right = min(left + tile_width, width)
-        if left < right:
-            rows.plain[:], rows.sums[:] = _ZERO, _ZERO
-            for row in range(top, bottom):
-                weights_of_row(images, source, view, row, left, right, weights[row - top])
-            for channel in range(channels):
-                tile = Tile((view * channels + channel) * height * width, top, bottom, left, right)
-                _tile(images, tile, scales, weights, rows, gradient)
-            _collect(rows.sums, sums[task])
+        _task(task, images, down, across, scales, source, rows, gradient, sums[task])
         task = claimed(counter)
 
 
-@part(fastmath=False)
-def _collect(rows, sums):  # type: ignore[no-untyped-def]
-    for k in range(2):
-        for j in range(_PITCH):
-            sums[k] += rows[k, j]
+@inlined
+def _task(task, images, down, across, scales, source, rows, gradient, sums):  # type: ignore[no-untyped-def]
+    channels, height, width = images.channels, images.height, images.width
+    view, place = task // (down * across), task % (down * across)
+    top, bottom = height * (place // across) // down, height * (place // across + 1) // down
+    left = TILE_WIDTH * (place % across)
+    right = min(left + TILE_WIDTH, width)
+    rows.plain[:], rows.weights[:], rows.inside[:], rows.sums[:] = _ZERO, _ZERO, _ZERO, _ZERO
+    for column in range(max(0, _REACH - left), min(right + _HALO, width + _REACH) - left):
+        rows.inside[_dealt(column)] = _ONE
+    for row in range(top, bottom):
+        weights_of_row(images, source, view, row, left, right, rows.weights[row - top])
+    for channel in range(channels):
+        tile = Tile((view * channels + channel) * height * width, top, bottom, left, right)
+        # The gradient's rows from `base` see SSIM's up to base + 5, and these see the image's up to base + 10.
+        for base in range(top - _HALO - _STEP, bottom, _STEP):
+            _moments_of_step(images, tile, base + _HALO, rows)
+            _similarity_of_step(images, tile, base + _REACH, rows)
+            _gradient_of_step(images, tile, base, scales, rows, gradient)
+            _shift_up(rows.fields)
+    for j in range(right - left):
+        sums[0] += rows.sums[_dealt(j)]
+        sums[1] += rows.sums[_PITCH + _dealt(j + _REACH)]
 
 
 @inlined
-def _tile(images, tile, scales, weights, rows, gradient):  # type: ignore[no-untyped-def]
-    for base in range(tile.top - _HALO - _STEP, tile.bottom, _STEP):
-        # The gradient's rows from `base` see SSIM's up to base + 5, and these see the image's up to base + 10.
-        _moments_of_step(images, tile, base + _HALO, rows)
-        for group in range(0, _STEP, _GROUP):
-            _similarity_of_group(images, tile, base + _REACH, group, rows, gradient.size > 0)
-        for group in range(0, _STEP, _GROUP):
-            _gradient_of_group(images, tile, base, group, scales, weights, rows, gradient)
-        for quantity in range(4):
-            _shift_up(rows.moments[quantity])
-        for quantity in range(3):
-            _shift_up(rows.slopes[quantity])
+def _dealt(column):  # type: ignore[no-untyped-def]
+    return column % _GROUP * _PLANE + column // _GROUP
+
+
+@inlined
+def _lines(columns):  # type: ignore[no-untyped-def]
+    """Return how many floats of each plane hold so many columns, in whole lines."""
+    return -(-columns // (_GROUP * _LINE)) * _LINE
 
 
 @part(fastmath=False)
 def _moments_of_step(images, tile, base, rows):  # type: ignore[no-untyped-def]
-    """Blur the moments of the image's rows from `base` along the row."""
+    """Write the moments of the image's rows from `base`."""
     first, last = max(0, tile.left - _HALO), min(images.width, tile.right + _HALO)
-    start, count = first - tile.left + _HALO, tile.right - tile.left + 2 * _REACH
-    plain = rows.plain
-    for k in range(_STEP):
-        row, at = base + k, (_HALO + k) * _PITCH
-        if not tile.top - _HALO <= row < tile.bottom + _HALO:
-            continue
+    start, count = first - tile.left + _HALO, _lines(tile.right - tile.left + 2 * _HALO)
+    for row in range(max(base, tile.top - _HALO), min(base + _STEP, tile.bottom + _HALO)):
+        x, y, at = rows.inside[_PITCH:], rows.inside[_PITCH:], tile.plane + row * images.width + first
         if 0 <= row < images.height:
-            source = tile.plane + row * images.width
-            x, y = images.x[source + first : source + last], images.y[source + first : source + last]
-            _moments(x, y, plain[0, start:], plain[1, start:], plain[2, start:], plain[3, start:])
-            for quantity in range(4):
-                _blur_along(plain[quantity], rows.moments[quantity, at:], count)
-        else:
-            rows.moments[:, at : at + _PITCH] = _ZERO
+            x, y = images.x[at:], images.y[at:]
+        _copy(x, rows.plain[start:], last - first)
+        _copy(y, rows.plain[_PITCH + start :], last - first)
+        _moments(rows.plain, rows.fields[(_HALO + row - base) * _PITCH :], count)
 
 
 @part(fastmath=False)
-def _similarity_of_group(images, tile, base, group, rows, wanted):  # type: ignore[no-untyped-def]
-    """Add the SSIM of a group of the rows from `base`; blur its slopes along the row."""
-    top, bottom = tile.top - _REACH, tile.bottom + _REACH
-    if base + group + _GROUP <= top or base + group >= bottom:
-        return
+def _similarity_of_step(images, tile, base, rows):  # type: ignore[no-untyped-def]
+    """Add the SSIM of the rows from `base`; write its slopes."""
     inner = tile.right - tile.left
-    blurred, made = rows.blurred, rows.made
-    for quantity in range(4):
-        _blur_across(rows.moments[quantity, group * _PITCH :], blurred[quantity], inner + 2 * _REACH)
-    _similarity(blurred[0], blurred[1], blurred[2], blurred[3], made[0], made[1], made[2], made[3])
-    outside, beyond = max(0, _REACH - tile.left), min(inner + 2 * _REACH, images.width - tile.left + _REACH)
-    for k in range(_GROUP):
-        row, at, here = base + group + k, (_HALO + group + k) * _PITCH, k * _PITCH
-        if tile.top <= row < tile.bottom:
-            _add(made[3, here + _REACH :], rows.sums[1], inner)
-        if not (wanted and top <= row < bottom):
-            continue
-        if 0 <= row < images.height:
-            for quantity in range(3):
-                made[quantity, here : here + outside] = _ZERO
-                made[quantity, here + beyond : here + inner + 2 * _REACH] = _ZERO
-                _blur_along(made[quantity, here:], rows.slopes[quantity, at:], inner)
-        else:
-            rows.slopes[:, at : at + _PITCH] = _ZERO
+    first, last = max(0, tile.top - _REACH - base), min(_STEP, tile.bottom + _REACH - base)
+    _blur_across(rows.fields, rows.across, 4, first, last, _lines(inner + 2 * _HALO))
+    for k in range(first, last):
+        inside = rows.inside[0 if 0 <= base + k < images.height else _PITCH :]
+        counted, out = np.float32(tile.top <= base + k < tile.bottom), rows.fields[4 * _FIELD + (_HALO + k) * _PITCH :]
+        _blur_along(rows.across[k * _PITCH :], rows.along, 4, _lines(inner + _HALO))
+        _similarity(rows.along, inside, counted, out, rows.sums[_PITCH:])
 
 
 @part(fastmath=False)
-def _gradient_of_group(images, tile, base, group, scales, weights, rows, gradient):  # type: ignore[no-untyped-def]
-    """Add the weighted errors of a group of the rows from `base`; write their gradient."""
-    if base + group + _GROUP <= tile.top or base + group >= tile.bottom:
-        return
-    inner, slopes = tile.right - tile.left, rows.blurred
-    if gradient.size > 0:
-        for quantity in range(3):
-            _blur_across(rows.slopes[quantity, group * _PITCH :], slopes[quantity], inner)
-    for k in range(max(0, tile.top - base - group), min(_GROUP, tile.bottom - base - group)):
-        row, here = base + group + k, k * _PITCH
-        at = tile.plane + row * images.width + tile.left
-        x, y, weight = images.x[at : at + inner], images.y[at : at + inner], weights[row - tile.top]
-        error_row(x, y, weight, rows.sums[0])
-        if gradient.size > 0:
-            out = gradient[at : at + inner]
-            _gradient_row(x, y, weight, slopes[0, here:], slopes[1, here:], slopes[2, here:], scales, out)
+def _gradient_of_step(images, tile, base, scales, rows, gradient):  # type: ignore[no-untyped-def]
+    """Add the weighted errors of the rows from `base`; write their gradient."""
+    inner = tile.right - tile.left
+    first, last = max(0, tile.top - base), min(_STEP, tile.bottom - base)
+    quantities, columns = (3, inner) if gradient.size > 0 else (0, 0)
+    _blur_across(rows.fields[4 * _FIELD :], rows.across, quantities, first, last, _lines(inner + _HALO))
+    for k in range(first, last):
+        pixels, weight, out = rows.fields[k * _PITCH :], rows.weights[base + k - tile.top], rows.plain[2 * _PITCH :]
+        _blur_along(rows.across[k * _PITCH :], rows.along, quantities, _lines(inner))
+        _gradient_row(pixels, weight, rows.along, scales, rows.sums, out, _lines(inner))
+        _copy(out, gradient[tile.plane + (base + k) * images.width + tile.left :], columns)
 
 
 @part(fastmath=False)
-def _shift_up(rows):  # type: ignore[no-untyped-def]
-    for j in range(_HALO * _PITCH):
-        rows[j] = rows[j + _STEP * _PITCH]
-
-
-@part(fastmath=False)
-def _add(row, sums, count):  # type: ignore[no-untyped-def]
+def _copy(row, out, count):  # type: ignore[no-untyped-def]
     for j in range(count):
-        sums[j] += row[j]
+        out[j] = row[j]
 
 
 @part(fastmath=False)
-def _moments(x, y, first, second, squares, product):  # type: ignore[no-untyped-def]
-    for j in range(x.size):
-        u, v = x[j], y[j]
-        first[j], second[j] = u, v
-        squares[j] = multiply_add(u, u, v * v)
-        product[j] = u * v
-
-
-@inlined
-def _window(a, b, c, d, e, f, g, h, i, j, k):  # type: ignore[no-untyped-def]
-    outer = multiply_add(_T1, b + j, _T0 * (a + k))
-    between = multiply_add(_T3, d + h, _T2 * (c + i))
-    middle = multiply_add(_T5, f, _T4 * (e + g))
-    return (outer + between) + middle
+def _shift_up(fields):  # type: ignore[no-untyped-def]
+    for field in range(0, 7 * _FIELD, _FIELD):
+        rows = fields[field:]
+        for j in range(_HALO * _PITCH):
+            rows[j] = rows[j + _STEP * _PITCH]
 
 
 @part(fastmath=False)
-def _blur_along(row, out, count):  # type: ignore[no-untyped-def]
-    """Blur a row to the values whose windows lie in it."""
-    for j in range(count):
-        out[j] = _window(
-            row[j], row[j + 1], row[j + 2], row[j + 3], row[j + 4], row[j + 5],
-            row[j + 6], row[j + 7], row[j + 8], row[j + 9], row[j + 10],
-        )  # fmt: skip
+def _moments(plain, out, count):  # type: ignore[no-untyped-def]
+    for j in range(min(count, _PLANE)):  # which LLVM must know, or 4 * j could be less than zero
+        _moment(plain[4 * j], plain[4 * j + _PITCH], out, j)
+        _moment(plain[4 * j + 1], plain[4 * j + 1 + _PITCH], out, j + _PLANE)
+        _moment(plain[4 * j + 2], plain[4 * j + 2 + _PITCH], out, j + 2 * _PLANE)
+        _moment(plain[4 * j + 3], plain[4 * j + 3 + _PITCH], out, j + 3 * _PLANE)
 
 
 @part(fastmath=False)
-def _blur_across(rows, out, count):  # type: ignore[no-untyped-def]
-    """Blur fourteen rows to a group of four."""
-    for j in range(count):
-        a, b, c = rows[j], rows[j + _PITCH], rows[j + 2 * _PITCH]
-        d, e, f = rows[j + 3 * _PITCH], rows[j + 4 * _PITCH], rows[j + 5 * _PITCH]
-        g, h, i = rows[j + 6 * _PITCH], rows[j + 7 * _PITCH], rows[j + 8 * _PITCH]
-        k, l, m = rows[j + 9 * _PITCH], rows[j + 10 * _PITCH], rows[j + 11 * _PITCH]
-        n, o = rows[j + 12 * _PITCH], rows[j + 13 * _PITCH]
-        out[j] = _window(a, b, c, d, e, f, g, h, i, k, l)
-        out[j + _PITCH] = _window(b, c, d, e, f, g, h, i, k, l, m)
-        out[j + 2 * _PITCH] = _window(c, d, e, f, g, h, i, k, l, m, n)
-        out[j + 3 * _PITCH] = _window(d, e, f, g, h, i, k, l, m, n, o)
+def _moment(x, y, out, j):  # type: ignore[no-untyped-def]
+    out[j], out[j + _FIELD] = x, y
+    out[j + 2 * _FIELD] = multiply_add(x, x, y * y)
+    out[j + 3 * _FIELD] = x * y
 
 
 @part(fastmath=False)
-def _similarity(means1, means2, squares, products, slope1, slope2, slope3, values):  # type: ignore[no-untyped-def]
-    """Write the halves of SSIM's three slopes, the second one negated, and its values."""
-    for j in range(means1.size):
-        mean1, mean2 = means1[j], means2[j]
+def _windows(a, b, c, d, e, f, g, h, i, j, k, l, m, n):  # type: ignore[no-untyped-def]
+    """Return the four windows of fourteen values: tap by tap, since then few registers are in use."""
+    p, q, r, s = _T0 * (a + k), _T0 * (b + l), _T0 * (c + m), _T0 * (d + n)
+    p, q = multiply_add(_T1, b + j, p), multiply_add(_T1, c + k, q)
+    r, s = multiply_add(_T1, d + l, r), multiply_add(_T1, e + m, s)
+    p, q = multiply_add(_T2, c + i, p), multiply_add(_T2, d + j, q)
+    r, s = multiply_add(_T2, e + k, r), multiply_add(_T2, f + l, s)
+    p, q = multiply_add(_T3, d + h, p), multiply_add(_T3, e + i, q)
+    r, s = multiply_add(_T3, f + j, r), multiply_add(_T3, g + k, s)
+    p, q = multiply_add(_T4, e + g, p), multiply_add(_T4, f + h, q)
+    r, s = multiply_add(_T4, g + i, r), multiply_add(_T4, h + j, s)
+    return multiply_add(_T5, f, p), multiply_add(_T5, g, q), multiply_add(_T5, h, r), multiply_add(_T5, i, s)
+
+
+@part(fastmath=False)
+def _blur_across(fields, out, quantities, first, last, count):  # type: ignore[no-untyped-def]
+    """Blur quantities across rows to the rows first <= k < last of a step."""
+    span = _PITCH if count == _PLANE else _PLANE  # full planes are one loop
+    for quantity in range(quantities):
+        for k in range(first // _GROUP * _GROUP, last, _GROUP):
+            for at in range(k * _PITCH, (k + 1) * _PITCH, span):
+                rows, blurred = fields[quantity * _FIELD + at :], out[quantity * _BLURRED + at :]
+                for j in range(span // _PLANE * count):
+                    blurred[j], blurred[j + _PITCH], blurred[j + 2 * _PITCH], blurred[j + 3 * _PITCH] = _windows(
+                        rows[j], rows[j + _PITCH], rows[j + 2 * _PITCH], rows[j + 3 * _PITCH], rows[j + 4 * _PITCH],
+                        rows[j + 5 * _PITCH], rows[j + 6 * _PITCH], rows[j + 7 * _PITCH], rows[j + 8 * _PITCH],
+                        rows[j + 9 * _PITCH], rows[j + 10 * _PITCH], rows[j + 11 * _PITCH], rows[j + 12 * _PITCH],
+                        rows[j + 13 * _PITCH],
+                    )  # fmt: skip
+
+
+@part(fastmath=False)
+def _blur_along(rows, out, quantities, count):  # type: ignore[no-untyped-def]
+    """Blur a row of quantities to the columns whose windows lie in it."""
+    for quantity in range(quantities):
+        row, blurred = rows[quantity * _BLURRED :], out[quantity * _PITCH :]
+        for j in range(count):
+            blurred[j], blurred[j + _PLANE], blurred[j + 2 * _PLANE], blurred[j + 3 * _PLANE] = _windows(
+                row[j], row[j + _PLANE], row[j + 2 * _PLANE], row[j + 3 * _PLANE], row[j + 1],
+                row[j + _PLANE + 1], row[j + 2 * _PLANE + 1], row[j + 3 * _PLANE + 1], row[j + 2],
+                row[j + _PLANE + 2], row[j + 2 * _PLANE + 2], row[j + 3 * _PLANE + 2], row[j + 3],
+                row[j + _PLANE + 3],
+            )  # fmt: skip
+
+
+@part(fastmath=False)
+def _similarity(rows, inside, counted, out, sums):  # type: ignore[no-untyped-def]
+    """Write the halves of SSIM's three slopes, the second one negated; add its values if they are counted: 1 or 0."""
+    for j in range(_PITCH):
+        mean1, mean2, squares, products = rows[j], rows[j + _PITCH], rows[j + 2 * _PITCH], rows[j + 3 * _PITCH]
         mean12, means = mean1 * mean2, multiply_add(mean1, mean1, mean2 * mean2)
-        above1, above2 = multiply_add(_TWO, mean12, _LUMINANCE), multiply_add(_TWO, products[j] - mean12, _CONTRAST)
-        below1, below2 = means + _LUMINANCE, (squares[j] - means) + _CONTRAST
-        scale = _ONE / (below1 * below2)
+        above1, above2 = multiply_add(_TWO, mean12, _LUMINANCE), multiply_add(_TWO, products - mean12, _CONTRAST)
+        below1, below2 = means + _LUMINANCE, (squares - means) + _CONTRAST
+        scale = inside[j] / (below1 * below2)
         slope = above1 * scale
         similarity = above2 * slope
-        slope1[j] = scale * multiply_add(mean2, above2 - above1, mean1 * similarity * (below1 - below2))
-        slope2[j] = similarity * below1 * scale
-        slope3[j] = slope
-        values[j] = similarity
+        out[j] = scale * multiply_add(mean2, above2 - above1, mean1 * similarity * (below1 - below2))
+        out[j + _FIELD] = similarity * below1 * scale
+        out[j + 2 * _FIELD] = slope
+        sums[j] = multiply_add(counted, similarity, sums[j])
 
 
 @part(fastmath=False)
-def error_row(x, y, weight, sums):  # type: ignore[no-untyped-def]
-    """Add the weighted absolute errors of a row to the sums of its columns."""
-    for j in range(x.size):
-        sums[j] = multiply_add(weight[j], abs(x[j] - y[j]), sums[j])
+def _gradient_row(pixels, weight, slopes, scales, sums, out, count):  # type: ignore[no-untyped-def]
+    """Add the weighted absolute errors of a row to the sums of its columns; write the gradient."""
+    for j in range(min(count, _PLANE)):
+        one, two, three = j + _PLANE, j + 2 * _PLANE, j + 3 * _PLANE  # the first column is the eleventh of the pixels
+        out[4 * j] = _gradient(pixels, two + 2, weight[4 * j], slopes, j, scales, sums)
+        out[4 * j + 1] = _gradient(pixels, three + 2, weight[4 * j + 1], slopes, one, scales, sums)
+        out[4 * j + 2] = _gradient(pixels, j + 3, weight[4 * j + 2], slopes, two, scales, sums)
+        out[4 * j + 3] = _gradient(pixels, one + 3, weight[4 * j + 3], slopes, three, scales, sums)
 
 
 @part(fastmath=False)
-def _gradient_row(x, y, weight, slope1, slope2, slope3, scales, out):  # type: ignore[no-untyped-def]
-    l1, ssim = scales
-    for j in range(x.size):
-        u, v = x[j], y[j]
-        sign = np.float32(u > v) - np.float32(u < v)
-        slope = multiply_add(v, slope3[j], slope1[j]) - u * slope2[j]
-        out[j] = multiply_add(ssim, slope, l1 * weight[j] * sign)
+def _gradient(pixels, at, weight, slopes, j, scales, sums):  # type: ignore[no-untyped-def]
+    (l1, ssim), x, y = scales, pixels[at], pixels[at + _FIELD]
+    sums[j] = multiply_add(weight, abs(x - y), sums[j])
+    sign = np.float32(x > y) - np.float32(x < y)
+    slope = multiply_add(y, slopes[j + 2 * _PITCH], slopes[j]) - x * slopes[j + _PITCH]
+    return multiply_add(ssim, slope, l1 * weight * sign)

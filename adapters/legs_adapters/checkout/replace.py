@@ -59,11 +59,9 @@ def _lock(root: Path, note: str, stop: Callable[[], None]) -> FileLock:
         try:
             return FileLock(root / _LOCK, wait=_POLL, note=note, remove=True)
         except HeldError as error:
-            who = f": {error}" if str(error) else ""
             if time.monotonic() > until:
-                raise LegsError(
-                    f"another legs-patch is running in {root}{who}; nothing was changed: wait for it"
-                ) from None
+                why = f"another legs-patch is running in {root}: {str(error) or 'it does not say which'}"
+                raise LegsError(f"{why}; nothing was changed: wait for it") from None
         except OSError as error:
             raise LegsError(f"{error.filename or root}: {error.strerror}; nothing was changed") from None
         stop()
@@ -187,20 +185,16 @@ def _keep_owner(file: int, before: os.stat_result) -> int:
 
 def _keep_attributes(before: int, after: int) -> None:
     """Give an open file the extended attributes of another one, access lists among them."""
-    if not hasattr(os, "listxattr"):  # Linux has it
-        return
     names: List[str] = []
-    with contextlib.suppress(OSError):  # no such thing in this file system
+    with contextlib.suppress(OSError, AttributeError):  # no such thing in this file system, or but on Linux
         names = os.listxattr(before)
+        os.removexattr(after, _ACCESS)  # the staging folder may have given it one
     for name in names:
         try:
             os.setxattr(after, name, os.getxattr(before, name))
         except OSError:  # the system's own, as labels of SELinux, are not everybody's to set
             if name.startswith(("user.", _ACCESS)):
                 raise
-    if _ACCESS not in names:  # the staging folder may have given it one
-        with contextlib.suppress(OSError):
-            os.removexattr(after, _ACCESS)
 
 
 def _put(root: Path, path: str, expected: Optional[bytes], staged: Optional[str]) -> None:

@@ -51,10 +51,7 @@ class Flow:
     """
 
     def __init__(
-        self,
-        body: cst.BaseSuite | cst.Module,
-        parameters: Optional[cst.Parameters] = None,
-        most: float = math.inf,
+        self, body: cst.BaseSuite | cst.Module, parameters: Optional[cst.Parameters] = None, most: float = math.inf
     ) -> None:
         self.steps: int = 0
         self._most = most

@@ -15,20 +15,14 @@ from legs_loss.system.files import read_regular
 VENDORED, SUBMODULE = "third-party code", "a submodule"
 WORKTREE, LINK, _TESTS = "another worktree of this checkout", "a link", "a folder of tests"
 CLOSED = "cannot be read: Permission denied"
-_FOREIGN = {
-    name: why
-    for why, names in (
-        (VENDORED, "submodules third_party third-party thirdparty external externals extern SIBR_viewers"),
-        (VENDORED, "croco dust3r mast3r vggt"),  # models that a checkout uses, some with trainers of its own beside
-        (_TESTS, "tests test testing"),
-        ("installed packages", "site-packages dist-packages node_modules venv env .venv .env .tox .nox .eggs"),
-        (
-            "tool output",
-            ".git .hg .svn __pycache__ .legs-patch.tmp .ipynb_checkpoints build dist .mypy_cache .pytest_cache",
-        ),
-    )
-    for name in names.split()
+_BY_REASON = {
+    VENDORED: "submodules third_party third-party thirdparty external externals extern SIBR_viewers"
+    " croco dust3r mast3r vggt",  # models that a checkout uses, some with trainers of their own beside
+    _TESTS: "tests test testing",
+    "installed packages": "site-packages dist-packages node_modules venv env .venv .env .tox .nox .eggs",
+    "tool output": ".git .hg .svn __pycache__ .legs-patch.tmp .ipynb_checkpoints build dist .mypy_cache .pytest_cache",
 }
+_FOREIGN = {name: why for why, names in _BY_REASON.items() for name in names.split()}
 PATCHABLE = (VENDORED, _TESTS, SUBMODULE, WORKTREE, LINK)
 _LARGEST = 1 << 20  # bytes of a .gitmodules, or of a .git that is a file
 _TEST_FILE = re.compile(r"^(test_.*|conftest)\.py$")

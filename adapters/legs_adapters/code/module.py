@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, TypeVar
 
 import libcst as cst
@@ -29,6 +30,7 @@ _STORED = re.compile(
 _DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
 
+@dataclass(eq=False)
 class Function:
     """A function, a method, or a module's top level.
 
@@ -37,42 +39,38 @@ class Function:
         node: its header; its body is ``body``.
         parent: the function around it, or the module's top level; None for the top level itself.
         owner: its class, for a method.
+        cut: the bytes of its body, where that is not part of ``node``.
         text: the text that contains it: its own body, or (where that was not cut out) the text around it. It is
             searched before anything is parsed.
     """
 
-    def __init__(
-        self,
-        module: Module,
-        node: cst.FunctionDef | cst.Module,
-        parent: Optional[Function] = None,
-        owner: Optional[Class] = None,
-        cut: Optional[slice] = None,
-    ) -> None:
-        self.module = module
-        self.node = node
-        self.parent = parent
-        self.owner = owner
-        self.name: str = node.name.value if isinstance(node, cst.FunctionDef) else ""
-        self._cut = cut
-        self._part: Optional[Part] = None
+    module: Module
+    node: cst.FunctionDef | cst.Module
+    parent: Optional[Function] = None
+    owner: Optional[Class] = None
+    cut: Optional[slice] = None
+    _part: Optional[Part] = None
+
+    def __post_init__(self) -> None:
         self._inner: List[Function] = []
-        around = parent.text if parent is not None and parent.parent is not None else module.outline_text
-        self.text: str = around if cut is None else module.lines.data[cut].decode("utf-8")
+        self.name: str = self.node.name.value if isinstance(self.node, cst.FunctionDef) else ""
+        is_inside = self.parent is not None and self.parent.parent is not None
+        around = self.parent.text if is_inside and self.parent is not None else self.module.outline_text
+        self.text: str = around if self.cut is None else self.module.lines.data[self.cut].decode("utf-8")
 
     @property
     @remembered
     def body(self) -> cst.BaseSuite | cst.Module:
         """Its statements, parsed on first use."""
-        if self._cut is not None and self.module.spend(parsing_steps(self.text)):
+        if self.cut is not None and self.module.spend(parsing_steps(self.text)):
             try:
-                self._part = body_part(self.module.lines, self._cut)
+                self._part = body_part(self.module.lines, self.cut)
                 header = self._part.tree.body[0]
                 assert isinstance(header, cst.FunctionDef)
                 self._inner = self.module.collect(header.body, self)
                 return header.body
             except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
-                before = self.module.lines.place(self._cut.start, self._cut.start).line - 2
+                before = self.module.lines.place(self.cut.start, self.cut.start).line - 2
                 self.module.failure = _failure(self.module.path, self.module.text, error, before)
         return self.node if isinstance(self.node, cst.Module) else self.node.body
 
@@ -80,7 +78,7 @@ class Function:
     @remembered
     def inner(self) -> List[Function]:
         """The functions that are defined in its body, and theirs, in source order."""
-        if self._cut is not None and _DEFINES.search(self.text):
+        if self.cut is not None and _DEFINES.search(self.text):
             assert self.body is not None  # which finds them
         return self._inner
 
@@ -137,14 +135,16 @@ class Function:
         return [name.split(".")[-1] for name in names]
 
 
+@dataclass(eq=False)
 class Class:
     """A class: its methods, and the values that they store in its attributes."""
 
-    def __init__(self, module: Module, node: cst.ClassDef, parent: Function) -> None:
-        self.module = module
-        self.node = node
-        self.parent = parent
-        self.name: str = node.name.value
+    module: Module
+    node: cst.ClassDef
+    parent: Function
+
+    def __post_init__(self) -> None:
+        self.name: str = self.node.name.value
         self.methods: Dict[str, Function] = {}
 
     @remembered

@@ -13,8 +13,6 @@ from legs_adapters.code.module import Class, Function, Module, index_by_word, pa
 from legs_adapters.code.sources import Source, Unreadable
 from legs_adapters.code.syntax import dotted
 
-_DEFINED = re.compile(r"def[ \t]+(\w+)")
-
 
 class Checkout:
     """The readable files of a checkout.
@@ -34,12 +32,7 @@ class Checkout:
         for path in map(PurePosixPath, self.sources):
             stem = path.parent.name if path.name == "__init__.py" else path.stem
             self._by_stem.setdefault(stem, []).append(path.as_posix())
-        texts = [(path, source.text) for path, source in self.sources.items()]
-        self._by_word = index_by_word(texts)
-        self._by_definition: Dict[str, List[str]] = {}
-        for file, text in texts:
-            for name in set(_DEFINED.findall(text)):
-                self._by_definition.setdefault(name, []).append(file)
+        self._by_word = index_by_word((path, source.text) for path, source in self.sources.items())
 
     def module(self, path: str) -> Optional[Module]:
         """Return a parsed file; None where it is none of these or does not parse (it is then among ``unreadable``)."""
@@ -82,7 +75,9 @@ class Checkout:
     @remembered
     def methods_named(self, name: str) -> List[Function]:
         """Return every method of this name in the checkout."""
-        modules = filter(None, map(self.module, self._by_definition.get(name, ())))
+        defined = re.compile(rf"def[ \t]+{re.escape(name)}\b")
+        paths = [path for path in self._by_word.get(name, ()) if defined.search(self.sources[path].text)]
+        modules = filter(None, map(self.module, paths))
         owners = [each for module in modules for each in module.by_node.values() if isinstance(each, Class)]
         return [owner.methods[name] for owner in owners if name in owner.methods]
 

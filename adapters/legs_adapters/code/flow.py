@@ -19,7 +19,6 @@ from legs_adapters.code.syntax import (
     dotted,
     every_parameter,
     key_of,
-    names_where,
     path_of,
     walk_expressions,
 )
@@ -44,9 +43,8 @@ class Flow:
         reads: every name that is read, in source order.
         returns: the expressions that it returns or yields.
         imports: its import statements.
-        contexts: by a node's id, the loops and the context managers around it (``with torch.no_grad():``), the
-            innermost last.
-        conditions: by a call's id, the names that must be true where it runs, ``if tracking:``, the innermost last.
+        contexts: by a node's id, the loops, the context managers (``with torch.no_grad():``) and the tests that must be
+            true around it (``if tracking:``), the innermost last.
         steps: how many it took: nodes that were visited, and copied definitions, four a step.
     """
 
@@ -57,13 +55,11 @@ class Flow:
         self._most = most
         self.definitions: Dict[str, List[Definition]] = {}
         self.contexts: Dict[int, Tuple[cst.CSTNode, ...]] = {}
-        self.conditions: Dict[int, Tuple[cst.Name | cst.Attribute, ...]] = {}
         self._reaching: Dict[int, Reaching] = {}
         self._visited: Dict[int, cst.CSTNode] = {}
         self._made: Dict[Tuple[int, str, str], Definition] = {}
         self._holders: Set[str] = set()  # places of which a part is defined: ``x`` and ``x.y`` of ``x.y['z']``
         self._around: Tuple[cst.CSTNode, ...] = ()
-        self._true: Tuple[cst.Name | cst.Attribute, ...] = ()
         self._loop_ends: Dict[int, Env] = {}  # by a loop's id: what its end hands back to its start
         self._exits: List[List[Env]] = []  # of the loops around: where a break or a continue leaves the body
         env = Env()
@@ -212,8 +208,8 @@ class Flow:
         copied.alive = env.alive
         return copied
 
-    def _inside(self, env: Env, body: cst.BaseSuite, *around: cst.CSTNode) -> None:
-        """Visit the body of a loop or of a ``with``."""
+    def _inside(self, env: Env, body: cst.CSTNode, *around: cst.CSTNode) -> None:
+        """Visit the body of a loop, a ``with`` or a branch."""
         outside = self._around
         self._around = (*outside, *around)
         self._visit(body, env)
@@ -221,13 +217,10 @@ class Flow:
 
     def _visit_If(self, node: cst.If, env: Env) -> None:
         self._visit(node.test, env)
-        outside, branch = self._true, self._copy(env)
-        self._true = outside + names_where(node.test, True)
-        self._visit(node.body, branch)
-        self._true = outside + names_where(node.test, False)
+        branch = self._copy(env)
+        self._inside(branch, node.body, node.test)
         if node.orelse is not None:
-            self._visit(node.orelse, env)
-        self._true = outside
+            self._inside(env, node.orelse, cst.UnaryOperation(cst.Not(), node.test))
         env.join(branch, env)
 
     def _visit_For(self, node: cst.For | cst.While, env: Env) -> None:
@@ -341,10 +334,6 @@ class Flow:
 
     def _visit_Del(self, node: cst.Del, env: Env) -> None:
         pass  # no read of a name
-
-    def _visit_Call(self, node: cst.Call, env: Env) -> None:
-        self.conditions[id(node)] = self._true
-        self._parts(node, env)
 
     def _visit_Arg(self, node: cst.Arg, env: Env) -> None:
         self._visit(node.value, env)  # the keyword is not a read of a name

@@ -153,7 +153,7 @@ def _squeezed(node: cst.CSTNode) -> str:
     return re.sub(r"\s+|#[^\n]*", "", code(bare))
 
 
-def names_where(test: cst.BaseExpression, holds: bool) -> Tuple[cst.Name | cst.Attribute, ...]:
+def names_where(test: cst.CSTNode, holds: bool) -> Tuple[cst.Name | cst.Attribute, ...]:
     """Return the names that are true where a test holds, or does not: ``tracking and x > 0``, ``not tracking``."""
     if isinstance(test, cst.UnaryOperation) and isinstance(test.operator, cst.Not):
         return names_where(test.expression, not holds)

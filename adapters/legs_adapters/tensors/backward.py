@@ -46,8 +46,8 @@ class Training:
         self._matters: Callable[[Function], bool] = lambda function: matters(function.text)
         self.roots: List[Function] = []
         self.sites: Dict[Function, List[Tuple[Function, cst.Call]]] = {}
-        self._trained: Set[int] = set()
-        self._scored: Dict[int, Tuple[Function, cst.Call]] = {}
+        # By an expression's id the call that alone takes its gradient, to be read; None for what is trained.
+        self._reached: Dict[int, Optional[Tuple[Function, cst.Call]]] = {}
         self._scoring: Optional[Tuple[Function, cst.Call]] = None  # the call from which the slice begins now
         self._touched: Set[Function] = set()
         self._met: Set[Tuple[Function, int]] = set()  # what ``sites`` has
@@ -105,7 +105,7 @@ class Training:
 
     def scores(self, node: cst.CSTNode) -> Optional[Tuple[Function, cst.Call]]:
         """Return the call of ``torch.autograd.grad`` that alone takes the gradient of this expression, to be read."""
-        return self._scored.get(id(node))
+        return self._reached.get(id(node))
 
     def _is_grad(self, function: Function, call: cst.Call) -> bool:
         """Return whether a call is ``torch.autograd.grad(...)``."""
@@ -113,7 +113,7 @@ class Training:
 
     def includes(self, node: cst.CSTNode) -> bool:
         """Return whether a backward pass reaches this expression."""
-        return id(node) in self._trained
+        return self._reached.get(id(node), ()) is None
 
     def touches(self, function: Function) -> bool:
         """Return whether a backward pass reaches an expression of this function."""
@@ -140,10 +140,7 @@ class Training:
             self._push(function, entry)
         if entries:
             return
-        if self._scoring is None:
-            self._trained.add(id(node))
-        else:
-            self._scored[id(node)] = self._scoring
+        self._reached.setdefault(id(node), self._scoring)
         if isinstance(node, cst.Call):
             self._call(function, node, key)
         elif isinstance(node, cst.Attribute) and node.attr.value in SIZES:

@@ -6,7 +6,7 @@ import functools
 from typing import TYPE_CHECKING, AbstractSet, List
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import root_of, words
+from legs_adapters.code.syntax import names_where, root_of, words
 from legs_adapters.lexicon.words import (
     EVALUATING,
     LOSS,
@@ -42,8 +42,9 @@ class Tracking(Rule):
     def evidence(self, term: Term) -> List[Decider]:
         names = () if term.trains_gaussians else term.names_around
         named = [decider for name, decider in names if _is_of_tracking(name)]
-        tests = reversed(term.function.flow.conditions.get(id(term.form.call), ()))
-        return [*named, *((term.function, part) for part in tests if _is_of_tracking(root_of(part)))][:1]
+        tests = reversed(term.function.flow.contexts.get(id(term.form.call), ()))
+        true = [name for test in tests for name in reversed(names_where(test, True)) if _is_of_tracking(root_of(name))]
+        return [*named, *((term.function, name) for name in true)][:1]
 
 
 class EvaluationName(Rule):

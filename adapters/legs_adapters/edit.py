@@ -11,7 +11,6 @@ An edit never changes the number of lines of the expression it replaces: comment
 
 from __future__ import annotations
 
-import re
 import sys
 from typing import List, Optional, Sequence
 
@@ -77,9 +76,8 @@ def _import(text: Text) -> Edit:
         first = [module.top.place(node).line for part in body[:1] for node in (part, *getattr(part, "decorators", ()))]
         at = module.lines.start(min(first)) if first else len(text.bytes)
         return text.replace(at, at, line + newline)
-    at = module.lines.start(module.top.place(anchor).last_line + 1)
-    before = re.findall(rb"(\r\n|\r|\n)?\Z", text.bytes[:at])[0].decode()  # "": the file ends without one
-    return text.replace(at, at, line + before if before else newline + line)
+    at = len(text.bytes[: module.lines.start(module.top.place(anchor).last_line + 1)].rstrip(b"\r\n"))
+    return text.replace(at, at, newline + line)
 
 
 def _anchor(body: Sequence[cst.CSTNode]) -> Optional[cst.SimpleStatementLine]:

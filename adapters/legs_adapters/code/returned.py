@@ -8,7 +8,7 @@ import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.syntax import constant
+from legs_adapters.code.syntax import constant, index_of
 
 
 def returned(function: Function) -> Optional[cst.CSTNode]:
@@ -47,16 +47,13 @@ def _filled(function: Function, node: cst.BaseExpression, names: Dict[str, cst.B
 
 def formatted_key(node: cst.Subscript) -> Optional[str]:
     """Return the literal part of the key of ``outputs[f"image_{i}"]``."""
-    index = node.slice[0].slice
-    value = index.value if len(node.slice) == 1 and isinstance(index, cst.Index) else None
+    value = index_of(node)
     parts = value.parts if isinstance(value, cst.FormattedString) else ()
     return "_".join(part.value for part in parts if isinstance(part, cst.FormattedStringText)) or None
 
 
 def default_key(function: Function, node: cst.Subscript) -> object:
     """Return ``"rgb"`` for ``preds[key]`` of a function with the parameter ``key="rgb"``."""
-    index = node.slice[0].slice
-    if len(node.slice) != 1 or not isinstance(index, cst.Index) or not isinstance(index.value, cst.Name):
-        return None
-    found = function.flow.reaching(index.value)
+    index = index_of(node)
+    found = function.flow.reaching(index) if isinstance(index, cst.Name) else None
     return constant(found.value) if isinstance(found, Definition) and found.kind == "parameter" else None

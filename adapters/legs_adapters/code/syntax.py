@@ -65,14 +65,16 @@ def _literal(text: str) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def index_of(node: cst.CSTNode) -> Optional[cst.BaseExpression]:
+    """Return the only index of ``x[index]``; None for any other node, and for a slice."""
+    index = node.slice[0].slice if isinstance(node, cst.Subscript) and len(node.slice) == 1 else None
+    return index.value if isinstance(index, cst.Index) and index.star is None else None
+
+
 def key_of(node: cst.CSTNode) -> Any:
     """Return the literal key of ``x["key"]`` or ``x[0]``, else None."""
-    if isinstance(node, cst.Subscript) and len(node.slice) == 1:
-        index = node.slice[0].slice
-        if isinstance(index, cst.Index) and index.star is None:
-            value = constant(index.value)
-            return value if isinstance(value, (str, int)) and not isinstance(value, bool) else None
-    return None
+    value = constant(index_of(node))
+    return value if isinstance(value, (str, int)) and not isinstance(value, bool) else None
 
 
 def path_of(node: cst.CSTNode) -> Optional[str]:

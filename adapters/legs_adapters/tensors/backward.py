@@ -25,6 +25,7 @@ from legs_adapters.tensors.operations import APPLIES, BACKWARD, ENDS_GRADIENT, H
 from legs_adapters.tensors.steps import is_backward
 
 TRAINS = re.compile(r"(?:backward|grad(?<!\wgrad))\s*\(")  # a text that runs a backward pass
+_Site = Tuple[Function, cst.Call]  # a call, behind the function that it stands in
 _ANY = object()
 _DEPTH = 2
 
@@ -45,16 +46,15 @@ class Training:
         self.program = program
         self._matters: Callable[[Function], bool] = lambda function: matters(function.text)
         self.roots: List[Function] = []
-        self.sites: Dict[Function, List[Tuple[Function, cst.Call]]] = {}
+        self._sites: Dict[Function, Dict[int, _Site]] = {}
         # By an expression's id the call that alone takes its gradient, to be read; None for what is trained.
-        self._reached: Dict[int, Optional[Tuple[Function, cst.Call]]] = {}
-        self._scoring: Optional[Tuple[Function, cst.Call]] = None  # the call from which the slice begins now
+        self._reached: Dict[int, Optional[_Site]] = {}
+        self._scoring: Optional[_Site] = None  # the call from which the slice begins now
         self._touched: Set[Function] = set()
-        self._met: Set[Tuple[Function, int]] = set()  # what ``sites`` has
         self._begun: Set[Function] = set()  # those in which the slice begins
         self._done: Set[Tuple[int, object]] = set()
         self._work: List[Tuple[Function, cst.CSTNode | Reaching, object]] = []
-        scoring: List[Tuple[Function, cst.Call]] = []
+        scoring: List[_Site] = []
         for module in program.matching(TRAINS):
             for function in module.scopes(TRAINS.search):
                 grads = [call for call in function.flow.calls if self._is_grad(function, call)]
@@ -68,6 +68,7 @@ class Training:
         for self._scoring in scoring:
             self._begin(self._scoring[0], _trained_by(self._scoring[1]), False)
             self._follow()
+        self.sites: Dict[Function, List[_Site]] = {runs: list(calls.values()) for runs, calls in self._sites.items()}
 
     def _is_applied(self, function: Function, call: Optional[cst.Call], names: Set[str], depth: int = 0) -> bool:
         """Return whether a parameter steps by a gradient, a call's or one of these names: ``p.grad = g``, ``p -= g``.
@@ -103,7 +104,7 @@ class Training:
             if function.module.spend(1):
                 self._reach(function, node, key) if isinstance(node, Reaching) else self._visit(function, node, key)
 
-    def scores(self, node: cst.CSTNode) -> Optional[Tuple[Function, cst.Call]]:
+    def scores(self, node: cst.CSTNode) -> Optional[_Site]:
         """Return the call of ``torch.autograd.grad`` that alone takes the gradient of this expression, to be read."""
         return self._reached.get(id(node))
 
@@ -176,19 +177,13 @@ class Training:
             if isinstance(reference.target, cst.Lambda):
                 self._push(function, reference.target.body)
             for callee in self.program.run_by(reference):
-                self._record(function, node, callee)
+                self._sites.setdefault(callee, {})[id(node)] = (function, node)
                 for value in callee.flow.returns if self._matters(callee) else ():
                     self._push(callee, value, key)
         for arg in node.args:
             self._push(function, arg.value)
         if not isinstance(node.func, cst.Name):
             self._push(function, owner or node.func)
-
-    def _record(self, caller: Function, call: cst.Call, callee: Function) -> None:
-        """Record a call through which a function contributes."""
-        if (callee, id(call)) not in self._met:
-            self._met.add((callee, id(call)))
-            self.sites.setdefault(callee, []).append((caller, call))
 
     def _place(self, function: Function, node: cst.CSTNode, key: object) -> None:
         found = self.program.lookup(function, node)

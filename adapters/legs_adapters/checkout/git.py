@@ -10,8 +10,8 @@ import hashlib
 import os
 import shutil
 import subprocess
-from pathlib import Path, PurePosixPath
-from typing import Dict, List, Mapping
+from pathlib import Path
+from typing import List, Mapping
 
 from legs_loss import LegsError
 
@@ -34,36 +34,30 @@ def changed_files(root: Path, files: Mapping[str, bytes]) -> List[str]:
     Raises:
         LegsError: git times out.
     """
-    by_folder: Dict[PurePosixPath, Dict[str, bytes]] = {}
-    for path in map(PurePosixPath, files):
-        by_folder.setdefault(path.parent, {})[path.name] = files[path.as_posix()]
-    found = ((at, _changed(root, root / at, inner)) for at, inner in by_folder.items())
-    return [(at / name).as_posix() for at, names in found for name in names]
-
-
-def _changed(root: Path, folder: Path, files: Mapping[str, bytes]) -> List[str]:
-    """Return which files of one folder differ from the last commit."""
     program = shutil.which("git")
     if program is None or root in Path(os.path.realpath(program)).parents:
         return []  # a "." on the path, or Windows, finds programs in the folder one is in
-    command = [program, "--no-pager", *_SAFE, "-C", str(folder), "ls-tree", "-z", "HEAD"]
+    return [path for path, data in files.items() if _committed(program, root / path) not in (b"", *_blob_ids(data))]
+
+
+def _committed(program: str, file: Path) -> bytes:
+    """Return the name that git gives to what was committed last of a file; nothing where it was not."""
+    command = [program, "--no-pager", *_SAFE, "-C", str(file.parent), "ls-tree", "-z", "HEAD", "--", file.name]
     try:
         listed = subprocess.run(
-            [*command, "--", *files],
+            command,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             timeout=_SECONDS, env={**os.environ, **_ENVIRONMENT},
         ).stdout  # fmt: skip
     except subprocess.TimeoutExpired:
-        why = f"git did not list the last commit of {folder} within {_SECONDS} seconds"
+        why = f"git did not find {file} in the last commit within {_SECONDS} seconds"
         raise LegsError(f"{why}; nothing was written: --force skips this check") from None
     except OSError:
-        return []
-    entries = [entry.partition("\t") for entry in listed.decode("utf-8", "surrogateescape").split("\0")]
-    committed = {name: words.rpartition(" ")[2] for words, _, name in entries}
-    return [name for name, data in files.items() if committed.get(name) not in (None, *_blob_ids(data))]
+        return b""
+    return listed.partition(b"\t")[0].rpartition(b" ")[2]
 
 
-def _blob_ids(data: bytes) -> List[str]:
+def _blob_ids(data: bytes) -> List[bytes]:
     """Return the names that git may give to a file's bytes: as they are or with LF line ends, by SHA-1 or SHA-256."""
     blobs = [b"blob %d\0" % len(text) + text for text in (data, data.replace(b"\r\n", b"\n"))]
-    return [digest(blob).hexdigest() for blob in blobs for digest in (hashlib.sha1, hashlib.sha256)]
+    return [digest(blob).hexdigest().encode() for blob in blobs for digest in (hashlib.sha1, hashlib.sha256)]

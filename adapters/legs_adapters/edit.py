@@ -11,6 +11,7 @@ An edit never changes the number of lines of the expression it replaces: comment
 
 from __future__ import annotations
 
+import itertools
 import sys
 from typing import List, Optional, Sequence
 
@@ -23,9 +24,6 @@ from legs_adapters.terms.findings import Findings
 from legs_adapters.terms.text import Edit, Text, apply_edits
 from legs_adapters.terms.writing import PACKAGE
 from legs_loss import LegsError
-
-_STRINGS = (cst.SimpleString, cst.ConcatenatedString)
-_IMPORTS = (cst.Import, cst.ImportFrom)
 
 
 def rewrite(findings: Findings, path: str, in_place: bool = False) -> List[Edit]:
@@ -82,15 +80,12 @@ def _import(text: Text) -> Edit:
 
 def _anchor(body: Sequence[cst.CSTNode]) -> Optional[cst.SimpleStatementLine]:
     """Return the statement that the import goes after: the last import above functions and classes, or a docstring."""
-    found: Optional[cst.SimpleStatementLine] = None
-    for statement in body:
-        if isinstance(statement, (cst.FunctionDef, cst.ClassDef)):
-            break
-        first = statement.body[0] if isinstance(statement, cst.SimpleStatementLine) else None
-        is_doc = statement is body[0] and isinstance(first, cst.Expr) and isinstance(first.value, _STRINGS)
-        if isinstance(statement, cst.SimpleStatementLine) and (is_doc or isinstance(first, _IMPORTS)):
-            found = statement
-    return found
+    top = itertools.takewhile(lambda each: not isinstance(each, (cst.FunctionDef, cst.ClassDef)), body)
+    lines = [each for each in top if isinstance(each, cst.SimpleStatementLine)]
+    first = lines[0].body[0] if lines and lines[0] is body[0] else None
+    is_doc = isinstance(first, cst.Expr) and isinstance(first.value, (cst.SimpleString, cst.ConcatenatedString))
+    imports = [each for each in lines if isinstance(each.body[0], (cst.Import, cst.ImportFrom))]
+    return imports[-1] if imports else lines[0] if is_doc else None
 
 
 def _is_imported(module: Module) -> bool:

@@ -148,12 +148,9 @@ class Training:
             pass
         elif isinstance(node, (cst.Name, cst.Attribute, cst.Subscript)):
             self._place(function, node, key)
-        elif isinstance(node, (cst.BaseSimpleComp, cst.DictComp)):
-            self._push(function, node.value if isinstance(node, cst.DictComp) else node.elt)
-            self._push(function, node.for_in)
-        elif isinstance(node, cst.CompFor):
-            self._push(function, node.iter)
-            self._push(function, node.inner_for_in)
+        elif isinstance(node, (cst.DictComp, cst.CompFor)):
+            for part in (node.value, node.for_in) if isinstance(node, cst.DictComp) else (node.iter, node.inner_for_in):
+                self._push(function, part)
         elif isinstance(node, cst.IfExp):
             self._push(function, node.body, key)
             self._push(function, node.orelse, key)

@@ -327,10 +327,9 @@ class Flow:
         whole = path_of(called.value) if isinstance(called, cst.Attribute) else None
         if isinstance(called, cst.Attribute) and whole is not None:
             name = called.attr.value
-            if name in MUTATORS:
-                self._add(env, Definition(whole, "mutate", node.value, node.value))
-            elif name.endswith("_") and not name.endswith("__"):
-                self._add(env, Definition(whole, "inplace", node.value, node.value))
+            is_inplace = name.endswith("_") and not name.endswith("__")
+            if name in MUTATORS or is_inplace:
+                self._add(env, Definition(whole, "inplace" if is_inplace else "mutate", node.value, node.value))
 
     def _visit_Del(self, node: cst.Del, env: Env) -> None:
         pass  # no read of a name

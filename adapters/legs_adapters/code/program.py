@@ -121,27 +121,23 @@ class Program(Checkout):
     # -- calls
 
     def _call(self, function: Function, node: cst.Call, depth: int) -> List[Reference]:
-        name = call_name(node)
-        if name == "partial" and node.args:
+        if call_name(node) == "partial" and node.args:
             return self.resolve(function, node.args[0].value, depth)
-        if name in self._returning_self and isinstance(node.func, cst.Attribute):
-            moved = [r for r in self.resolve(function, node.func.value, depth) if r.kind in ("instance", "made by")]
-            if moved:
-                return moved
-        wrapped = self._wrapped(function, node, depth)
-        if wrapped:
-            return wrapped
+        same = self._same(function, node, depth)
+        if same:
+            return same
         made = self.resolve(function, node.func, depth)
         instances = [Reference("instance", ref.target) for ref in made if ref.kind == "class"]
         instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]
         return instances + self._returned(made, depth)
 
-    def _wrapped(self, function: Function, node: cst.Call, depth: int) -> List[Reference]:
-        """Resolve ``DataParallel(model)``."""
-        name = "." + (dotted(node.func) or call_name(node))
-        given = arguments(node)[0] if name.endswith(self._wrapping) else []
-        found = self.resolve(function, given[0], depth + 1) if given else []
-        return [reference for reference in found if reference.kind == "instance"]
+    def _same(self, function: Function, node: cst.Call, depth: int) -> List[Reference]:
+        """Resolve calls that return what they are given: ``model.cuda()``, ``DataParallel(model)``."""
+        name, func = call_name(node), node.func
+        if name in self._returning_self and isinstance(func, cst.Attribute):
+            return [ref for ref in self.resolve(function, func.value, depth) if ref.kind in ("instance", "made by")]
+        given = arguments(node)[0][:1] if f".{dotted(func) or name}".endswith(self._wrapping) else []
+        return [ref for each in given for ref in self.resolve(function, each, depth) if ref.kind == "instance"]
 
     def _returned(self, made: List[Reference], depth: int) -> List[Reference]:
         """Resolve what functions return: ``render = get_renderer(kind)``."""

@@ -30,7 +30,7 @@ _STORED = re.compile(
 _DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)  # the text of one would be that of all its nodes
 class Function:
     """A function, a method, or a module's top level.
 
@@ -135,7 +135,7 @@ class Function:
         return [name.split(".")[-1] for name in names]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)  # the text of one would be that of all its nodes
 class Class:
     """A class: its methods, and the values that they store in its attributes."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import subprocess
 import sys
 
 import pytest
@@ -13,6 +12,7 @@ from hypothesis import strategies as st
 
 from legs_loss.runtime import memo as memo_module
 from legs_loss.runtime.memo import _OVERHEAD, WeightMemo, _identity_key
+from tests.preloaded import run
 from tests.support import legs_environment
 
 
@@ -174,7 +174,7 @@ took = resident() - before
 print(took / memo.bytes)
 raise SystemExit(not 0.9 < took / memo.bytes < 1.5)
 """
-        done = subprocess.run([sys.executable, "-c", script], env=legs_environment(), capture_output=True, text=True)
+        done = run([sys.executable, "-c", script], env=legs_environment())
         assert done.returncode == 0, done.stdout + done.stderr
 
     def test_the_forms_of_a_target_are_remembered_apart(self):

@@ -28,9 +28,8 @@ _levels: Any = getattr(_functorch, "peek_interpreter_stack", None)
 _modes: Any = getattr(torch._C, "_len_torch_dispatch_stack", None)
 # Of the dispatch modes, those under which a tensor may have no memory; others, as torch's FlopCounterMode, only watch.
 _mode_of: Any = getattr(torch._C, "_get_dispatch_mode", None)
-_MEMORYLESS = [
-    getattr(getattr(torch._C, "_TorchDispatchModeKey", None), key, None) for key in ("FAKE", "PROXY", "FUNCTIONAL")
-]
+_keys: Any = getattr(torch._C, "_TorchDispatchModeKey", None)
+_MEMORYLESS = [getattr(_keys, key, None) for key in ("FAKE", "PROXY", "FUNCTIONAL")]
 
 
 def is_differentiated() -> bool:
@@ -101,7 +100,6 @@ def check_order(prediction: Tensor, target: Tensor) -> None:
     """
     if not is_trained(prediction) and is_trained(target):
         raise LegsError(
-            "of the two images only the second requires a gradient, so it seems to be the rendering, and the weights "
-            "would come from it: turn them round, loss(rendering, photograph). Where a photograph is learned from a "
-            "fixed rendering, call it by legs_loss.unweighted(l1_loss), or give legs_loss a weight="
+            "of the two images only the second requires a gradient, so it seems to be the rendering: turn them round, "
+            "loss(rendering, photograph). For a photograph that is learned: legs_loss.unweighted(l1_loss), or a weight="
         )

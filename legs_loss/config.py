@@ -99,9 +99,7 @@ def is_off(environ: Optional[Mapping[str, str]] = None) -> bool:
     value = (os.environ if environ is None else environ).get("LEGS_OFF", "")
     word = value.strip().lower()
     if word not in _TRUE + _FALSE:
-        raise LegsError(
-            f"environment variable LEGS_OFF must be 1 or 0 (or true, false, yes, no, on, off), got {value!r}"
-        )
+        raise LegsError(f"environment variable LEGS_OFF must be 1 or 0 (true, yes, on; false, no, off), got {value!r}")
     return word in _TRUE
 
 

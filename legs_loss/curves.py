@@ -47,10 +47,8 @@ def curve(name: str) -> Curve:
     try:
         return _CURVES[name]
     except (KeyError, TypeError):
-        raise LegsError(
-            f"no curve is named {name!r}: choose one of {', '.join(_CURVES)}, "
-            "or add your own with register_curve(name, function)" + did_you_mean(name, _CURVES)
-        ) from None
+        choice = f"{', '.join(_CURVES)}, or add your own with register_curve(name, function)"
+        raise LegsError(f"no curve is named {name!r}: choose one of {choice}{did_you_mean(name, _CURVES)}") from None
 
 
 def curve_names() -> Tuple[str, ...]:
@@ -78,16 +76,13 @@ def register_curve(name: str, function: Curve) -> None:
         raise LegsError(f"a curve's name is a non-empty string, got {name!r}")
     if name in _CURVES:
         raise LegsError(f"a curve named {name!r} exists already: choose another name")
-    if not callable(function):
-        raise LegsError(f"curve {name!r} must be a function, got {function!r}")
     import torch
 
     x = torch.linspace(0.0, 1.0, 257)
-    y = function(x.clone())
+    y = function(x.clone()) if callable(function) else function
     if not isinstance(y, torch.Tensor) or y.shape != x.shape or y.is_complex():
-        raise LegsError(f"curve {name!r} must return a real tensor of its input's shape")
+        raise LegsError(f"curve {name!r} must return a real tensor of its input's shape, got {y!r}")
     if not bool(((y >= 0.0) & (y <= 1.0)).all()):
-        raise LegsError(
-            f"curve {name!r} must map [0, 1] into [0, 1]: its values run from {float(y.min()):g} to {float(y.max()):g}"
-        )
+        span = f"from {float(y.min()):g} to {float(y.max()):g}"
+        raise LegsError(f"curve {name!r} must map [0, 1] into [0, 1]: its values run {span}")
     _CURVES[name] = function

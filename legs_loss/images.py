@@ -114,14 +114,9 @@ def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str =
     if not image.is_floating_point():
         raise LegsError(f"{name} is of type {image.dtype}: give floats in [0, 1] (8-bit images: image / 255.0)")
     if image.dim() == 0 or image.numel() == 0:
-        raise LegsError(
-            f"{name} must be an image [H, W], [C, H, W] or [H, W, C], or a batch [B, C, H, W] or [B, H, W, C], "
-            f"got {shape_of(image)}"
-        )
+        raise LegsError(f"{name} must be an image [H, W], [C, H, W] or [H, W, C], or a batch, got {shape_of(image)}")
     if image.dim() == 1 or (image.dim() == 2 and not {*image.shape}.isdisjoint(_CHANNELS)):
-        raise LegsError(
-            f"{name} {shape_of(image)} is a list of pixels: a weight map needs the whole image, [C, H, W] or [H, W, C]"
-        )
+        raise LegsError(f"{name} {shape_of(image)} is a list of pixels: a weight map needs the whole image, [C, H, W]")
     if image.dim() == 2:
         return Layout(image.shape, False)
     first, last = image.shape[-3], image.shape[-1]
@@ -137,11 +132,9 @@ def read_layout(image: Tensor, channels_last: Optional[bool] = None, name: str =
         )
     channel, other = (last, first) if channels_last else (first, last)
     if channel > max(_CHANNELS) and other in _CHANNELS:
-        raise LegsError(
-            f"{name} {shape_of(image)} has its channels {'first' if channels_last else 'last'}: leave "
-            f"channels_last={bool(channels_last)} out of the call"
-        )
-    return Layout(image.shape, bool(channels_last))
+        what = f"{name} {shape_of(image)} has its channels {'first' if channels_last else 'last'}"
+        raise LegsError(f"{what}: leave channels_last={channels_last} out of the call")
+    return Layout(image.shape, channels_last)
 
 
 def read_pair(
@@ -179,7 +172,5 @@ def check_values(image: Tensor, name: str = "target") -> None:
         why = "a weight map cannot be made from it; look at how this view is loaded"
         raise LegsError(f"{name} {shape_of(image)} has values that are NaN or infinite: {why}")
     if largest > _SURELY_NOT_UNIT_RANGE:
-        raise LegsError(
-            f"{name} {shape_of(image)} has values up to {largest:g}: images are in [0, 1] here "
-            "(8-bit images: image / 255.0)"
-        )
+        what = f"{name} {shape_of(image)} has values up to {largest:g}"
+        raise LegsError(f"{what}: images are in [0, 1] here (8-bit images: image / 255.0)")

@@ -135,8 +135,7 @@ def whole(lambda_dssim: float, padding: str) -> Optional[Terms]:
     Raises:
         LegsError: the share is no number in [0, 1], or no padding has that name.
     """
-    is_number = isinstance(lambda_dssim, (int, float)) or (isinstance(lambda_dssim, Tensor) and lambda_dssim.dim() == 0)
-    if not (is_number and 0.0 <= lambda_dssim <= 1.0):
+    if not (isinstance(lambda_dssim, (int, float, Tensor)) and 0.0 <= lambda_dssim <= 1.0):
         raise LegsError(f"lambda_dssim must be in [0, 1], got {lambda_dssim!r}")
     if padding != "zeros":
         check_window(WINDOW_SIZE, padding)

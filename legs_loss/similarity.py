@@ -88,11 +88,8 @@ def _window(channels: int, size: int, like: Tensor) -> Tensor:
 
 def _new_window(channels: int, size: int) -> Tensor:
     # On the CPU whatever the default device: a sum that rounds the other way there moves SSIM by 1e-5.
-    taps = torch.tensor(
-        [math.exp(-((x - size // 2) ** 2) / float(2 * SIGMA**2)) for x in range(size)],
-        dtype=torch.float32,
-        device="cpu",
-    )
+    values = [math.exp(-((x - size // 2) ** 2) / float(2 * SIGMA**2)) for x in range(size)]
+    taps = torch.tensor(values, dtype=torch.float32, device="cpu")
     taps = (taps / taps.sum()).unsqueeze(1)
     return taps.mm(taps.t()).expand(channels, 1, size, size).contiguous()
 
@@ -104,9 +101,8 @@ def _padded(first: Tensor, second: Tensor, padding: str, window_size: int) -> Tu
     height, width = first.shape[-2:]
     smallest = {"reflect": margin + 1, "replicate": 1, "valid": window_size}
     if min(height, width) < smallest[padding]:
-        raise LegsError(
-            f'padding "{padding}" needs images of at least {smallest[padding]} pixels a side, got {shape_of(first)}'
-        )
+        needed = f"images of at least {smallest[padding]} pixels a side"
+        raise LegsError(f'padding "{padding}" needs {needed}, got {shape_of(first)}')
     if padding == "valid":
         return first, second, 0
     sides = (margin,) * 4

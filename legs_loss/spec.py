@@ -124,6 +124,5 @@ def as_spec(spec: Spec) -> WeightSpec:
     try:
         return PRESETS[spec]
     except (KeyError, TypeError):
-        raise LegsError(
-            f"no preset is named {spec!r}: choose one of {', '.join(PRESETS)}" + did_you_mean(spec, PRESETS)
-        ) from None
+        choice = ", ".join(PRESETS) + did_you_mean(spec, PRESETS)
+        raise LegsError(f"no preset is named {spec!r}: choose one of {choice}") from None

@@ -18,6 +18,7 @@ from legs_loss.images import read_pair
 from legs_loss.kernels.backends import fused, plan_of
 from legs_loss.kernels.contract import L1
 from legs_loss.loss import mean_error
+from legs_loss.responses import NEEDS_LEVELS
 from legs_loss.runtime import state
 from legs_loss.runtime.own import check_own
 from legs_loss.runtime.state import ViewName, current_run, spec_to_compile, thread
@@ -78,10 +79,8 @@ def l1_loss(
         read_pair(prediction, target)  # the error names which
     if not isinstance(reduction, str) or reduction not in ("mean", "none"):
         raise LegsError(f'reduction must be "mean" or "none", got {reduction!r}')
-    if own is not None and not callable(own):
-        raise LegsError(f"own must be a function of (prediction, target), got {own!r}")
-    if own is not None and (mask is not None or reduction != "mean"):
-        raise LegsError("own= replaces mask= and reduction=: what it returns is returned")
+    if own is not None and not (callable(own) and mask is None and reduction == "mean"):
+        raise LegsError(f"own= must be a function, without mask= and reduction= beside it, got {own!r}")
     given = (mask, channels_last, reduction, own)
     if is_compiling():
         return _by_torch(prediction, target, _compiled_weights(prediction, target), *given)
@@ -116,10 +115,8 @@ def _compiled_weights(prediction: Tensor, target: Tensor) -> Weights:
     if spec is None and not thread.unweighted:
         check_order(prediction, target)
     if spec is not None and spec.over == "scene":
-        raise LegsError(
-            "weights that are normalised over the scene are made of a store's levels, which a compiled graph cannot "
-            "read: leave the loss out of torch.compile, or set LEGS_PRESET=legs"
-        )
+        where, then = "a compiled graph cannot read", "and leave the loss out of torch.compile"
+        raise LegsError(NEEDS_LEVELS.format(where=where, then=then))
     return Weights(spec)
 
 
@@ -138,9 +135,8 @@ def _by_torch(
         if own is not None:
             return own(prediction, target)
         if mean and mask is None:
-            types = prediction.dtype, target.dtype
-            if not torch.promote_types(*types).is_floating_point or torch.bool in types:
-                raise LegsError(f"the images are of types {types}: give floats in [0, 1] (8-bit images: image / 255.0)")
+            if prediction.is_complex() or target.is_complex():
+                read_pair(prediction, target)  # it takes floats
             try:
                 return torch.abs(prediction - target).mean()
             except RuntimeError:

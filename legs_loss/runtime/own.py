@@ -47,9 +47,8 @@ def check_own(own: Callable[..., Any], target: Tensor) -> None:
         return
     if not is_l1:
         raise LegsError(
-            f"own= is no L1: {_TIMES} times the difference gives {grown:,.0f} times the loss, so a weight on "
-            "the difference would not be one on the loss. Where a setting chooses it, choose the L1; else leave this "
-            "line to the codebase's own loss, or set LEGS_OFF=1"
+            f"own= is no L1: {_TIMES} times the difference gives {grown:,.0f} times the loss, which no weight scales. "
+            "Where a setting chooses it, choose the L1; else leave this line to the codebase's own loss, or LEGS_OFF=1"
         )
     if is_known:
         if len(_known) >= _MOST:

@@ -189,10 +189,8 @@ class TrainingRun:
         if self.stored.has(MASK):
             weights += f"; masks from {self.config.store}"
             self.tell_at_end()
-        say_first(
-            f"L1 weighted, preset {self.config.preset}: {spec.operator}, {spec.curve}, beta {spec.beta:g}; {weights}; "
-            f"settings from {self.config.source}",
-        )
+        made = f"preset {self.config.preset}: {spec.operator}, {spec.curve}, beta {spec.beta:g}"
+        say_first(f"L1 weighted, {made}; {weights}; settings from {self.config.source}")
 
     def tell_at_end(self) -> None:
         """Have the process's last line say what the masks of this run were used for."""
@@ -255,9 +253,8 @@ def spec_to_compile(number: int, is_trained: bool) -> Optional[WeightSpec]:
     if not is_trained:
         if run.active and (is_differentiated() or is_in_a_node()):
             raise LegsError(
-                "torch.func, forward-mode AD, a re-entrant checkpoint or a Function of autograd with torch.compile: "
-                "the graph does not show whether l1_loss is trained, so weighted. Leave one of them out, or call "
-                "legs_loss, which always is"
+                "torch.func, forward AD, a re-entrant checkpoint or an autograd.Function with torch.compile: the graph "
+                "does not show whether l1_loss is trained. Leave one of them out, or call legs_loss: always weighted"
             )
         return None
     refuse_masks(number)

@@ -124,9 +124,8 @@ class Stored:
         levels = None if store is None else store.scene_levels(self._config.spec, pixels)
         if levels is None:
             where = "no store of this run has" if store is None else f"{store.path} does not have for {pixels} pixels"
-            raise LegsError(
-                NEEDS_LEVELS.format(where=where, then="and let the run find its store (-s SCENE, LEGS_STORE)")
-            )
+            then = "and let the run find its store (-s SCENE, LEGS_STORE)"
+            raise LegsError(NEEDS_LEVELS.format(where=where, then=then))
         return levels
 
     def _find(self, store: WeightStore, image: Tensor, view: Optional[str]) -> Optional[Found]:

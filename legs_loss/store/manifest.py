@@ -163,7 +163,5 @@ def read_manifest(folder: Path) -> List[Entry]:
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError):
         intact = False
     if not intact:
-        raise DamagedStoreError(
-            f"{path} is damaged: delete that file and run legs precompute again, which makes the maps again"
-        )
+        raise DamagedStoreError(f"{path} is damaged: delete that file, and run legs precompute again to make the maps")
     return entries

@@ -134,7 +134,7 @@ class TestOwn:
 
     def test_takes_the_place_of_mask_and_reduction(self):
         for settings in ({"mask": torch.ones(4, 4)}, {"reduction": "none"}):
-            with pytest.raises(LegsError, match="own= replaces"):
+            with pytest.raises(LegsError, match="without mask= and reduction= beside it"):
                 l1_loss(*pair(3, 4, 4), own=F.l1_loss, **settings)
 
     @pytest.mark.parametrize("name", NO_L1)

@@ -76,6 +76,7 @@ def plan_of(
         or prediction.is_neg()  # their memory has other values
         or target.is_neg()
         or target.requires_grad
+        or not (prediction.layout is target.layout is torch.strided)
     ):
         layout, prediction, target = read_pair(prediction, target, channels_last)
         return LossPlan(layout, spec=spec), prediction, target

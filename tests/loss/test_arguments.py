@@ -55,7 +55,7 @@ def given(function):
 @pytest.mark.parametrize(("function", "argument"), OTHERS, ids=lambda name: name)
 def test_of_another_type(function, argument):
     for wrong in NEITHER:
-        if not any(wrong is right for right in OTHERS[function, argument]):
+        if not any(type(wrong) is type(right) and wrong == right for right in OTHERS[function, argument]):
             with pytest.raises(LegsError) as raised:
                 getattr(legs_loss, function)(**{**given(function), argument: wrong})
             assert repr(wrong) in str(raised.value) or f"got {type(wrong).__name__}" in str(raised.value)

@@ -127,8 +127,7 @@ class Purposes:
         found = callees(self.program, function, call)
         if not found and isinstance(call.func, cst.Attribute):
             found = self.program.methods_named(name)  # one of them may run
-        runs = [each for each in found if not any(map(is_backward, each.flow.calls))]
-        steps = [step for each in runs for inner in each.flow.calls for step in self._steps(each, inner, depth + 1)]
+        steps = [step for each in found for inner in each.flow.calls for step in self._steps(each, inner, depth + 1)]
         holder = call.func.value if isinstance(call.func, cst.Attribute) else None
         if holder is None or not steps:
             return steps
@@ -177,9 +176,7 @@ class Purposes:
         name = set(words(optimiser.attr.value)) if isinstance(optimiser, cst.Attribute) else set()
         found = said | (name if name & POSES else words_in(optimiser))  # gaussians.optimizer_cam moves cameras
         for where, given in self._given(function, optimiser, makers):
-            leaves = [leaf for _, leaf in self._leaves(where, given)]
-            leaves += where.flow.assigned(given) if leaves == [given] else []  # a name of no list
-            found |= set().union(*map(_named_in, leaves))
+            found |= set().union(*(_named_in(leaf) for _, leaf in self._leaves(where, given)))
         return found - PLUMBING
 
     def _moved_by(self, step: _Step) -> Optional[List[_Value]]:

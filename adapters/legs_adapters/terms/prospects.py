@@ -13,7 +13,7 @@ from typing import Dict, FrozenSet, Iterable, Iterator, List, NamedTuple, Set, T
 
 from legs_adapters.code.module import CALLED
 from legs_adapters.lexicon.words import SPEAKS_OF_L1, SPEAKS_OF_LOSS
-from legs_adapters.tensors.operations import HOLDERS, MODULE_SELF
+from legs_adapters.tensors.operations import HOLDERS
 
 _WORD = re.compile(r"[^\W\d](?<![\w\"'].)\w*(?![\"'])")  # no key, no setting: ``split="train"``
 _DEFINITION = re.compile(r"^([ \t]*)(?:async[ \t]+)?(def|class)[ \t]+(\w+)", re.M)
@@ -36,12 +36,6 @@ _DEFAULT = re.compile(
     r"\b(\w+)(?:[ \t]*:[^=,()\n]{1,200})?[ \t]*=[ \t]*([\w.]{0,99}[lL]1\w{0,99})(?![\w.]{0,99}[ \t]*\()"
 )
 _BRANCHES = re.compile(r"^[ \t]+(?:if|for|while|with|try|async)\b", re.M)
-# What is computed is no function: arithmetic, or what a method returns that is no module's own.
-_COMPUTED = re.compile(
-    r"^(?![^\n]*(?:lambda|[\"'])).*(?:[\w)\]][ \t]*[-+*/@][ \t]*[\w(]"
-    rf"|[)\]]\.(?!(?:{'|'.join(sorted(MODULE_SELF))})\()\w+\([^()]*\)[ \t]*$)",
-    re.S,
-)
 
 
 class _Words(NamedTuple):
@@ -128,7 +122,7 @@ def _entries(text: str) -> Iterator[_Entry]:
         if not name.endswith("__") and name != "backward":
             returned = [_held(value) for value in _RETURNED.findall(body)]
             yield f"{name}()", _NONE, _NONE if not returned else _joined(returned)
-            is_l1 = _takes_two(body) and (SPEAKS_OF_LOSS.search(name) or not _BRANCHES.search(body))
+            is_l1 = SPEAKS_OF_LOSS.search(name) or not _BRANCHES.search(body)
             yield name, words, words if is_l1 else _Words(frozenset([f"{name}()"]), False)
     for match in _GIVEN.finditer(text):
         if not match.group(1).endswith("__") and match.group(1) != "_":
@@ -158,11 +152,4 @@ def _held(value: str) -> _Words:
         is_class = name[:1].isupper()
         names = [f"{name}()", name] if is_class else [f"{name}()"]
         return _Words(frozenset(names), is_class and SPEAKS_OF_L1.search(name) is not None)
-    return _NONE if _COMPUTED.match(value) else _Words.of(value)
-
-
-def _takes_two(body: str) -> bool:
-    """Return whether a function may have two parameters beside ``self``."""
-    header = body.partition(")")[0].lstrip()[1:]
-    names = [part.partition(":")[0].strip() for part in header.split(",")]
-    return len([name for name in names if name not in ("", "self", "cls", "*", "/")]) > 1 or "(" in header
+    return _Words.of(value)

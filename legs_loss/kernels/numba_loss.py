@@ -14,13 +14,13 @@ from legs_loss.images import check_values
 from legs_loss.kernels.codes import CURVES
 from legs_loss.kernels.compiling import claimed, compiled, in_threads, multiply_add, part, said
 from legs_loss.kernels.contract import Backend, PreparedLoss, Terms
-from legs_loss.kernels.numba_response import Images, extremes, operator_of
+from legs_loss.kernels.numba_response import NO_FLOATS, Images, extremes, operator_of
 from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles
 from legs_loss.kernels.numba_weights import FORMULAS, WeightSource, weights_of_row
 from legs_loss.spec import WeightSpec
 
 _ROWS = 16  # of a strip of the L1 alone
-_NO_RANGE, _NO_MAP = np.empty((0, 2), np.float32), np.empty(0, np.float32)
+_NO_RANGE = np.empty((0, 2), np.float32)
 
 
 class _NumbaBackend(Backend):
@@ -51,7 +51,7 @@ class _NumbaLoss(PreparedLoss):
         self.eps = np.float32(0.0 if spec is None else spec.eps)
         made = WeightSpec() if spec is None else spec
         curve, beta = 0 if spec is None else CURVES[spec.curve], np.float32(made.beta)
-        self.source = WeightSource(curve, beta, _NO_RANGE, operator_of(made), _NO_MAP)
+        self.source = WeightSource(curve, beta, _NO_RANGE, operator_of(made), NO_FLOATS, NO_FLOATS)
         self.steps = np.float32(terms.l1 / self.size), np.float32(2.0 * terms.ssim / self.size)  # of halves of slopes
         down, across = -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)
         self.tiles, self.strips = (self.sizes[0] * down * across, down, across), self.sizes[0] * -(-height // _ROWS)
@@ -61,13 +61,14 @@ class _NumbaLoss(PreparedLoss):
     ) -> Tuple[Tensor, Optional[Tensor]]:
         y = _flat(target)
         images, source = Images(_flat(prediction), y, *self.sizes), self.source
+        gradient = np.empty(self.wanted, np.float32)
         if self.spec is not None:
-            found = self._range(y, target) if range_ is None else range_.numpy().copy()
+            # The gradient's memory keeps the responses until it is written.
+            found = self._range(y, target, gradient) if range_ is None else range_.numpy().copy()
             found[:, 1] = 1 / (found[:, 1] + self.eps)
-            source = source._replace(ranges=found)
+            source = source._replace(ranges=found, responses=gradient if range_ is None else NO_FLOATS)
         if map_ is not None:
             source = source._replace(map=_flat(map_))
-        gradient = np.empty(self.wanted, np.float32)
         if self.terms.ssim == 0.0:
             sums = np.empty(self.strips)
             in_threads(all_strips, self.strips, images, source, self.steps[0], gradient, sums)
@@ -87,8 +88,8 @@ class _NumbaLoss(PreparedLoss):
     def response_range(self, target: Tensor) -> Tensor:
         return torch.from_numpy(self._range(_flat(target), target))
 
-    def _range(self, flat: np.ndarray, target: Tensor) -> np.ndarray:
-        found = extremes(flat.reshape(self.sizes), self.source.operator)
+    def _range(self, flat: np.ndarray, target: Tensor, responses: np.ndarray = NO_FLOATS) -> np.ndarray:
+        found = extremes(flat.reshape(self.sizes), self.source.operator, responses)
         if np.add.reduce(found[:, 2]) != 0.0:  # or NaN; overshoots are fine
             check_values(target)
         found[:, 1] -= found[:, 0]

@@ -14,6 +14,7 @@ from legs_loss.kernels.compiling import claimed, compiled, in_threads, inlined, 
 from legs_loss.spec import WeightSpec
 
 _ROWS = 32  # of a task
+NO_FLOATS = np.empty(0, np.float32)
 _ZERO, _ONE, _FOUR, _EIGHT = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(8.0)
 
 
@@ -50,16 +51,18 @@ def operator_of(spec: WeightSpec) -> OperatorCode:
     return OperatorCode(stencil, np.float32(side), np.float32(middle), NORMS[spec.p])
 
 
-def extremes(image: np.ndarray, operator: OperatorCode) -> np.ndarray:
+def extremes(image: np.ndarray, operator: OperatorCode, responses: np.ndarray = NO_FLOATS) -> np.ndarray:
     """Return the extremes of each view of float32 [B, C, H, W], as float32 [B, 3].
 
     The least and the greatest response; 0, or more (or NaN) where values exceed 1 in magnitude or are not finite.
+    The responses themselves are written to `responses`, float32 [B * C * H * W], if it has a size: to the first
+    channel of each view.
     """
     views, channels, height, width = image.shape
     strips = -(-height // _ROWS)
     found = np.empty((views * strips, 3), np.float32)
     images = Images(image.reshape(-1), image.reshape(-1), views, channels, height, width)
-    in_threads(_strips, views * strips, images, operator, strips, found)
+    in_threads(_strips, views * strips, images, operator, strips, responses, found)
     out, found = np.empty((views, 3), np.float32), found.reshape(views, strips, 3)
     for number, join in enumerate((np.minimum, np.maximum, np.add)):
         join.reduce(found[:, :, number], 1, out=out[:, number])
@@ -67,15 +70,16 @@ def extremes(image: np.ndarray, operator: OperatorCode) -> np.ndarray:
 
 
 @compiled(fastmath=False)
-def _strips(counter, tasks, images, operator, strips, found):  # type: ignore[no-untyped-def]
+def _strips(counter, tasks, images, operator, strips, responses, found):  # type: ignore[no-untyped-def]
     height, width = images.height, images.width
-    row = np.empty(width, np.float32)
+    own = np.empty(width, np.float32)
     low, high, excess = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     task = claimed(counter)
     while task < tasks:
         view, strip = task // strips, task % strips
         low[:], high[:], excess[:] = np.float32(np.inf), _ZERO, _ZERO
         for i in range(strip * _ROWS, min((strip + 1) * _ROWS, height)):
+            row = responses[(view * images.channels * height + i) * width :][:width] if responses.size > 0 else own
             response_row(images, operator, view, i, np.int64(0), width, row)
             _join_extremes(row, low, high)
             for channel in range(images.channels):
@@ -104,29 +108,23 @@ def _add_excess(row, excess):  # type: ignore[no-untyped-def]
 @inlined
 def _folded(index, size):  # type: ignore[no-untyped-def]
     """Reflect an index that is one beyond the edge; a side of one pixel continues itself."""
-    if index < 0:
-        index = -index
-    if index >= size:
-        index = 2 * size - 2 - index
-    return max(index, 0)
+    return max(min(abs(index), 2 * size - 2 - abs(index)), 0)
 
 
 @part(fastmath=False)
 def response_row(images, operator, view, row, left, right, out):  # type: ignore[no-untyped-def]
     """Write the response of the pixels left <= j < right of a row of a photograph to out."""
     image, channels, height, width = images.y, images.channels, images.height, images.width
-    for j in range(right - left):
-        out[j] = _ZERO
+    out[: right - left] = _ZERO
     first, last = max(left, 1), min(right, width - 1)
     for channel in range(channels):
         plane = (view * channels + channel) * height * width
         above = image[plane + _folded(row - 1, height) * width :][:width]
         here = image[plane + row * width :][:width]
         below = image[plane + _folded(row + 1, height) * width :][:width]
-        if first < last:
-            _join_inner(
-                above[first - 1 :], here[first - 1 :], below[first - 1 :], last - first, operator, out[first - left :]
-            )
+        _join_inner(
+            above[first - 1 :], here[first - 1 :], below[first - 1 :], last - first, operator, out[first - left :]
+        )
         for j in range(0, width, max(1, width - 1)):  # the first and the last, whose neighbours are one
             if left <= j < right:
                 beside, at = _folded(j + 1, width), j - left

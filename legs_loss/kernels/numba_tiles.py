@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from legs_loss.kernels.compiling import claimed, compiled, inlined, multiply_add, part
-from legs_loss.kernels.numba_weights import weights_of_row
+from legs_loss.kernels.numba_weights import copy_row, weights_of_row
 from legs_loss.similarity import CONTRAST_CONSTANT, LUMINANCE_CONSTANT, SIGMA, WINDOW_SIZE
 
 _REACH = WINDOW_SIZE // 2
@@ -58,7 +58,7 @@ class Rows(NamedTuple):
     """A task's memory, rows of _PITCH floats; their columns are dealt to planes, but for plain and weights.
 
     plain: a row of x, of y and of the gradient; of x and y the columns outside the image stay zero.
-    weights: of the tile's rows; zero beyond its columns.
+    weights: of the tile's rows; what lies beyond its columns counts in no sum.
     fields: four moments, then three slopes: the rows of this step, below the ten before them.
     across: the four moments of a step's rows, blurred across rows; of the slopes three.
     along: a row of these, blurred along the row as well.
@@ -90,7 +90,7 @@ def all_tiles(counter, tasks, images, down, across, scales, source, gradient, su
     """
     rows = Rows(
         np.empty(3 * _PITCH, np.float32),
-        np.empty((-(-images.height // down), _PITCH), np.float32),
+        np.zeros((-(-images.height // down), _PITCH), np.float32),
         np.zeros(7 * _FIELD, np.float32),
         np.zeros(4 * _BLURRED + _LINE, np.float32),
         np.zeros(4 * _PITCH + _LINE, np.float32),
@@ -110,7 +110,7 @@ def _task(task, images, down, across, scales, source, rows, gradient, sums):  # 
     top, bottom = height * (place // across) // down, height * (place // across + 1) // down
     left = TILE_WIDTH * (place % across)
     right = min(left + TILE_WIDTH, width)
-    rows.plain[:], rows.weights[:], rows.inside[:], rows.sums[:] = _ZERO, _ZERO, _ZERO, _ZERO
+    rows.plain[:], rows.inside[:], rows.sums[:] = _ZERO, _ZERO, _ZERO
     for column in range(max(0, _REACH - left), min(right + _HALO, width + _REACH) - left):
         rows.inside[_dealt(column)] = _ONE
     for row in range(top, bottom):
@@ -148,8 +148,8 @@ def _moments_of_step(images, tile, base, rows):  # type: ignore[no-untyped-def]
         x, y, at = rows.inside[_PITCH:], rows.inside[_PITCH:], tile.plane + row * images.width + first
         if 0 <= row < images.height:
             x, y = images.x[at:], images.y[at:]
-        _copy(x, rows.plain[start:], last - first)
-        _copy(y, rows.plain[_PITCH + start :], last - first)
+        copy_row(x, rows.plain[start:], last - first)
+        copy_row(y, rows.plain[_PITCH + start :], last - first)
         _moments(rows.plain, rows.fields[(_HALO + row - base) * _PITCH :], count)
 
 
@@ -177,13 +177,7 @@ def _gradient_of_step(images, tile, base, scales, rows, gradient):  # type: igno
         pixels, weight, out = rows.fields[k * _PITCH :], rows.weights[base + k - tile.top], rows.plain[2 * _PITCH :]
         _blur_along(rows.across[k * _PITCH :], rows.along, quantities, _lines(inner))
         _gradient_row(pixels, weight, rows.along, scales, rows.sums, out, _lines(inner))
-        _copy(out, gradient[tile.plane + (base + k) * images.width + tile.left :], columns)
-
-
-@part(fastmath=False)
-def _copy(row, out, count):  # type: ignore[no-untyped-def]
-    for j in range(count):
-        out[j] = row[j]
+        copy_row(out, gradient[tile.plane + (base + k) * images.width + tile.left :], columns)
 
 
 @part(fastmath=False)

@@ -27,6 +27,7 @@ class WeightSource(NamedTuple):
     beta: of that weight.
     ranges: float32 [views, 2]: the min response, and the reciprocal of max - min + eps.
     operator: of the response that it is made from.
+    responses: as of `extremes`, or empty: then they are made once more.
     map: float32 [height * width] for all views, or [views * height * width], or empty.
     """
 
@@ -34,6 +35,7 @@ class WeightSource(NamedTuple):
     beta: np.float32
     ranges: np.ndarray
     operator: OperatorCode
+    responses: np.ndarray
     map: np.ndarray
 
 
@@ -58,10 +60,12 @@ def weights_of_row(images, source, view, row, left, right, out):  # type: ignore
     """Write the weights of the pixels left <= j < right of a row of a view to out."""
     height, width, count = images.height, images.width, right - left
     if source.curve == 0:
-        for j in range(count):
-            out[j] = _ONE
+        out[:count] = _ONE
     else:
-        response_row(images, source.operator, view, row, left, right, out)
+        if source.responses.size > 0:
+            copy_row(source.responses[(view * images.channels * height + row) * width + left :], out, count)
+        else:
+            response_row(images, source.operator, view, row, left, right, out)
         _weigh(out, count, source.curve, source.beta, source.ranges[view, 0], source.ranges[view, 1])
     if source.map.size > 0:
         at = (row if source.map.size == height * width else view * height + row) * width + left
@@ -72,6 +76,13 @@ def weights_of_row(images, source, view, row, left, right, out):  # type: ignore
 def _weigh(out, count, curve, beta, low, scale):  # type: ignore[no-untyped-def]
     for j in range(count):
         out[j] = _ONE + beta * _curved(curve, (out[j] - low) * scale)
+
+
+@part(fastmath=False)
+def copy_row(row, out, count):  # type: ignore[no-untyped-def]
+    """Copy the first values of a row."""
+    for j in range(count):
+        out[j] = row[j]
 
 
 @part(fastmath=False)

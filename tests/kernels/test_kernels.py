@@ -25,7 +25,7 @@ from legs_loss.responses import response
 from legs_loss.scenes.images import image_tensor
 from legs_loss.spec import PRESETS
 from legs_loss.weights import Weights
-from tests.kernels.support import by_signature, compare, images, used
+from tests.kernels.support import by_signature, compare, images, range_of, used
 from tests.preloaded import run
 from tests.support import legs_environment
 
@@ -187,6 +187,17 @@ class TestResponse:
             torch.testing.assert_close(found[:, 0], expected.amin(1), rtol=3e-7, atol=0.0)
             torch.testing.assert_close(found[:, 1], expected.amax(1), rtol=3e-7, atol=0.0)
             assert not found[:, 2].any()
+
+    @pytest.mark.parametrize("shape", [(2, 3, 33, 40), (3, 1, 5, 7), (1, 4, 270, 431)])
+    @pytest.mark.parametrize("lambda_dssim", [0.0, 0.2])
+    def test_those_that_its_extremes_kept_weight_as_those_that_are_made_once_more(self, shape, lambda_dssim):
+        spec, made = PRESETS["legs"], []
+        prediction, target = images(shape)
+        for found in (None, range_of(numba_loss.BACKEND, target, spec)):
+            loss = numba_loss.BACKEND.loss(terms_of(lambda_dssim), prediction, target, Weights(spec=spec, range=found))
+            made.append((loss.item(), *torch.autograd.grad(loss, prediction)))
+        assert made[0][0] == made[1][0] > 0.0
+        assert torch.equal(made[0][1], made[1][1])
 
     @pytest.mark.parametrize(("value", "excess"), [(1.5, 0.5), (-3.0, 2.0), (float("inf"), float("inf"))])
     def test_values_beyond_one_are_noticed(self, value, excess):

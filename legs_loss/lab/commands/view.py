@@ -1,6 +1,6 @@
 """View trained Gaussians in the browser.
 
-PATH is a .ply of 3DGS, the output folder of a training (of legs train, 3DGS or its forks), a folder of several, as legs
+Give a .ply of 3DGS, the output folder of a training (of legs train, 3DGS or its forks), a folder of several, as legs
 demo writes, or a comparison. Methods can be switched on and off, and two compared with a slider; with a scene, its
 cameras are shown with their photographs or weight maps. Colours do not depend on the direction (degree 0).
 """

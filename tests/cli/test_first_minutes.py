@@ -181,6 +181,16 @@ class TestFirstQuarterOfAnHour:
         text = capsys.readouterr().out
         assert text.startswith("usage: legs ") and "\n    precompute " in text
 
+    @pytest.mark.parametrize(
+        "command", ["precompute", "export", "show", "info", "compare", "demo", "scene", "train", "view"]
+    )
+    def test_a_description_names_its_arguments_as_the_usage_does(self, capsys, command):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        usage, description = capsys.readouterr().out.split("\n\n")[:2]
+        arguments = r"\b(?:PATH|SCENE|STORE|OUT|RUN|PLY|PHOTOS|DIR|FOLDER|FILE|COMPARISON)\b"
+        assert set(re.findall(arguments, description)) <= set(re.findall(arguments, usage))
+
     def test_legs_patch_and_the_sub_command_are_one(self, capsys, tmp_path):
         pytest.importorskip("libcst")
         import legs_adapters.cli as command

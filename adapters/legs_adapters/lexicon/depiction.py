@@ -97,7 +97,8 @@ class Meanings:
             return Meaning("gradient", self.meaning(function, node.left).role)  # type: ignore[attr-defined]
         parts = [self.meaning(function, part) for part in parts_of(node)]
         is_change = isinstance(getattr(node, "operator", None), cst.Subtract) and len(parts) == 2
-        if is_change and parts[0] == parts[1] and parts[0].kind == "image" and parts[0].role:  # of two views or moments
+        pictures = parts[0].kind in ("image", "logarithm") if is_change else False
+        if pictures and parts[0] == parts[1] and parts[0].role:  # of two views or moments
             return Meaning("gradient", parts[0].role)
         return mix(parts, isinstance(node, cst.BinaryOperation))
 

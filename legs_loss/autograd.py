@@ -49,9 +49,8 @@ def is_in_a_node() -> bool:
         if code.co_name in _OF_NODES and code.co_argcount:
             first = frame.f_locals.get(code.co_varnames[0])
             # A context has no next functions where the graph does not get this node.
-            if isinstance(first, torch.autograd.function.FunctionCtx) and getattr(first, "next_functions", None):
-                return True
-            if type(first).__name__ == "AutogradFunctionApplyVariable":
+            is_node = isinstance(first, torch.autograd.function.FunctionCtx) and getattr(first, "next_functions", None)
+            if is_node or type(first).__name__ == "AutogradFunctionApplyVariable":
                 return True
             if getattr(first, "setup_context", _SETUP) is not _SETUP:  # its forward has no context
                 return any(isinstance(one, Tensor) and one.requires_grad for one in frame.f_locals["args"])

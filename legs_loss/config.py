@@ -139,10 +139,8 @@ def store_folder(value: Any, base: Path) -> Optional[Path]:
     """
     if not isinstance(value, (str, Path, type(None))) or "\0" in str(value):
         raise LegsError(f"store must be a path, got {repr(value)[:100]}")
-    if value is None or value == "":
-        return None
     try:
-        return base / Path(value).expanduser()
+        return base / Path(value).expanduser() if value else None
     except RuntimeError:
         raise LegsError(f"store must be a path, got {repr(value)[:100]}, and there is no such user") from None
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, Optional, Tuple
+from functools import lru_cache
+from typing import Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -69,21 +70,18 @@ def d_ssim(prediction: Tensor, target: Tensor, padding: str = "zeros", channels_
     return 1.0 - ssim_map(prediction, target, padding, channels_last).mean()
 
 
-_windows: Dict[Tuple[Any, ...], Tensor] = {}  # made on the CPU once, not uploaded at every call
-
-
 def _window(channels: int, size: int, like: Tensor) -> Tensor:
     """Return the window [channels, 1, size, size] on the device and of the type of an image."""
     if is_compiling() or is_transformed():
         return _new_window(channels, size).to(like)  # part of the graph
-    key = channels, size, like.device, like.dtype
-    window = _windows.get(key)
-    if window is None:
-        with torch.inference_mode(False):  # autograd saves no tensor of inference mode
-            window = _new_window(channels, size).to(like)
-        if type(window) is Tensor:  # of a fake mode it stands for no values
-            _windows[key] = window
-    return window
+    return _kept_window(channels, size, like.device, like.dtype)
+
+
+@lru_cache(maxsize=64)
+def _kept_window(channels: int, size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Return a window that was made on the CPU once, and is not uploaded at every call."""
+    with torch.inference_mode(False):  # autograd saves no tensor of inference mode
+        return _new_window(channels, size).to(device, dtype)
 
 
 def _new_window(channels: int, size: int) -> Tensor:

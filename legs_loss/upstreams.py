@@ -62,13 +62,12 @@ def apply_to(library: str) -> Applied:
     applied = Applied()
     try:
         known[library]()(applied)
-    except ModuleNotFoundError as error:
-        if error.name == library:
+    except (ModuleNotFoundError, AttributeError) as error:
+        missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else f"{library}."
+        if missing == library:
             raise LegsError(f"{library} is not installed") from None
-        if not (error.name or "").startswith(f"{library}."):
+        if not missing.startswith(f"{library}."):
             raise
-        raise LegsError(f"this {library} does not have the expected loss: {error}") from None
-    except AttributeError as error:
         raise LegsError(f"this {library} does not have the expected loss: {error}") from None
     _applied[library] = applied
     applied.callback(_applied.pop, library, None)

@@ -102,10 +102,8 @@ class WeightMemo:
 
     def _make_room(self, size: int) -> bool:
         unused = [key for key, entry in self._entries.items() if not entry.used]
-        for key in unused:
-            if self.bytes + size <= self.limit:
-                break
-            self._drop(key)
+        while unused and self.bytes + size > self.limit:
+            self._drop(unused.pop(0))
         return self.bytes + size <= self.limit
 
 
@@ -160,16 +158,8 @@ def _identity_key(target: Tensor) -> _Key:
         return None, None
     # `camera.original_image[:3]` is a new tensor every step; its base tensor is not.
     owner = target if target._base is None else target._base
-    key = (
-        id(owner),
-        target.data_ptr(),
-        version,
-        target.shape,
-        target.stride(),
-        target.dtype,
-        _current_stream(target.device),
-    )
-    return key, owner
+    stream = _current_stream(target.device)
+    return (id(owner), target.data_ptr(), version, target.shape, target.stride(), target.dtype, stream), owner
 
 
 _raw_stream: Any = getattr(torch._C, "_cuda_getCurrentRawStream", None)  # some microseconds faster

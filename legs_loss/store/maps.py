@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,11 +45,10 @@ def _head(entry: Entry) -> bytes:
 
 def is_intact(folder: Path, entry: Entry) -> bool:
     """Return whether an entry's map can be read and is the one that was written."""
-    try:
+    with suppress(DamagedStoreError):
         read_map(folder, entry)
-    except DamagedStoreError:
-        return False
-    return True
+        return True
+    return False
 
 
 def stage(staging: Path, entry: Entry, normalised: np.ndarray) -> Entry:

@@ -189,7 +189,7 @@ class TestDropIn:
 
 
 def test_the_window_is_made_once_and_never_in_a_mode_that_spoils_it(monkeypatch):
-    monkeypatch.setattr(module, "_windows", {})
+    module._kept_window.cache_clear()
     made = []
     new_window = module._new_window
     monkeypatch.setattr(module, "_new_window", lambda *args: made.append(args) or new_window(*args))
@@ -202,10 +202,10 @@ def test_the_window_is_made_once_and_never_in_a_mode_that_spoils_it(monkeypatch)
     ssim(prediction.detach().double(), target.double())
     assert len(made) == 2  # one a type
     fake = pytest.importorskip("torch._subclasses.fake_tensor").FakeTensorMode()
-    monkeypatch.setattr(module, "_windows", {})
+    module._kept_window.cache_clear()
     with fake:
         ssim(torch.empty(1, 12, 12), torch.empty(1, 12, 12))
-    assert not module._windows
+    assert module._kept_window.cache_info().currsize == 0
 
 
 @pytest.mark.skipif(not hasattr(torch.device, "__enter__"), reason="torch 2 makes a device a context")

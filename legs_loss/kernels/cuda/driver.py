@@ -69,8 +69,7 @@ class CudaDriver:
             getattr(library, name).argtypes = arguments
         self._library, self._runtime, self._launch_kernel = library, runtime, library.cuLaunchKernel
         torch.empty(1, device=device)  # torch makes the context before it is asked for
-        index = runtime.current_device() if device.index is None else device.index
-        self._index = index
+        self._index = index = runtime.current_device() if device.index is None else device.index
         properties = runtime.get_device_properties(index)
         self.architecture: int = 10 * properties.major + properties.minor
         self.multiprocessors: int = properties.multi_processor_count

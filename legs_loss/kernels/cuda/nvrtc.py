@@ -34,9 +34,7 @@ def candidates(folders: Iterable[Path], major: str, platform: str = sys.platform
     for folder in folders:
         wheels = folder / "nvidia"
         nested = [folder] if folder.name == "lib" else sorted([*wheels.glob("*/*"), *wheels.glob("*/bin/x86_64")])
-        for place in nested:
-            if not place.is_dir():
-                continue
+        for place in filter(Path.is_dir, nested):
             yield from (path for path in sorted(place.iterdir()) if name.match(path.name))
 
 

@@ -87,9 +87,9 @@ def test_names_comments_spaces_and_docstrings_are_not_in_the_form(old, new):
     assert form(SSIM.replace(old, new)) == form(SSIM)
 
 
-def test_a_keyword_of_the_checkouts_own_function_has_no_proven_form_and_one_of_torchs_is_kept():
+def test_a_keyword_of_the_checkouts_own_function_has_no_form_and_one_of_torchs_is_kept():
     by_keyword = SSIM.replace("channel, size_average)\n", "channel=channel, size_average=size_average)\n")
-    assert by_keyword != SSIM and form(by_keyword) not in FORMS
+    assert by_keyword != SSIM and form(by_keyword) is None
     stride = "def ssim(a, padding, stride):\n    return torch.nn.functional.conv2d(a, a, {}={})\n"
     made = {form("import torch\n" + stride.format(*names)) for names in (("padding", "padding"), ("stride", "padding"))}
     assert len(made) == 2 and None not in made

@@ -130,6 +130,8 @@ class Meanings:
 
     def _is_behind(self, function: Function, node: cst.Subscript) -> bool:
         """Return whether one channel behind the colours is taken: ``x[3]``, ``x[-1:]``, ``x.split([3, 1])[1]``."""
+        if len(node.slice) > 1 and isinstance(node.slice[-1].slice, cst.Slice) and _cut(node) == (-1, None):
+            return self.meaning(function, node.value) != UNKNOWN  # no last sample of a ray: ends[..., -1:, 0]
         index = node.slice[0].slice if len(node.slice) == 1 else None
         is_last = isinstance(index, cst.Slice) and index.upper is None and constant(index.lower) == -1
         at = constant(index.value) if isinstance(index, cst.Index) else -1 if is_last else None
@@ -216,6 +218,8 @@ class Meanings:
 
     def _element(self, function: Function, value: cst.CSTNode, index: int) -> Meaning:
         """Return the meaning of an element of what is unpacked."""
+        if _table_of(function, value) is not None and index == 1:
+            return self.meaning(function, value)
         if not isinstance(value, cst.Call):
             held = function.flow.value_of(value) or value
             literal = held.elements if isinstance(held, (cst.Tuple, cst.List)) else ()
@@ -228,6 +232,8 @@ class Meanings:
             return Meaning("channel", self.meaning(function, value).role)
         if call_name(value) == "zip" and index < len(given):
             return self.meaning(function, given[index])
+        if call_name(value) == "split" and index == 0 and given and isinstance(value.func, cst.Attribute):
+            return self._first(function, value.func.value if constant(given[0]) is not None else given[0], True)
         # A renderer that returns a tuple returns the image first; the rest have names of their own.
         meaning = self.meaning(function, value)
         if meaning.kind == "image" and index > 0:

@@ -53,9 +53,9 @@ class Ways(Meanings):
             return kept if kept != UNKNOWN else self.meaning(function, node.value)
         kind, says, role = kind_of_words(name), role_of_words(name), self.meaning(function, node.value).role
         if role is not None:  # a renderer may hand on what it was given
-            is_other = says == "target" or BACKGROUND & set(words(name)) or self._holds_data(node.value)
+            is_other = says == "target" or BACKGROUND & set(words(name)) or self._holds_data(function, node.value)
             return Meaning(kind, None if is_other else role)
-        is_photograph = kind == "image" and says != "render" and self._holds_data(node.value)
+        is_photograph = kind == "image" and says != "render" and self._holds_data(function, node.value)
         return Meaning(kind, "target" if is_photograph else None)
 
     def _draws_splats(self, function: Function, call: cst.Call) -> bool:
@@ -65,15 +65,25 @@ class Ways(Meanings):
         texts += [run.module.path + code(run.body) for reference in found for run in self.program.run_by(reference)]
         return bool(GAUSSIANS & words_in(call)) or any(map(SPLATS.search, texts))
 
-    @staticmethod
-    def _holds_data(node: cst.CSTNode) -> bool:
+    def _holds_data(self, function: Function, node: cst.CSTNode | Reaching) -> bool:
         """Return whether an object is a camera or a dataset's entry, by its name or those of what it is taken from.
 
         A camera of a view that was warped, or that nobody photographed, is none: ``pseudo_cam``.
         """
-        names = [root_of(part) for part in attribute_chain(node) if isinstance(part, (cst.Name, cst.Attribute))]
-        is_held = any(DATA & set(words(name)) for name in names) and "warp" not in map(kind_of_words, names)
-        return is_held and "render" not in map(role_of_words, names)
+        return self.questions.answer(function, node, self._holds, False)
+
+    def _holds(self, function: Function, node: cst.CSTNode | Reaching) -> bool:
+        if isinstance(node, Reaching):
+            parts = [node.value] if isinstance(node, Definition) else node.parts
+            return any(part is not None and self._holds_data(function, part) for part in parts)
+        chain = list(attribute_chain(node))
+        names = [root_of(part) for part in chain if isinstance(part, (cst.Name, cst.Attribute))]
+        if "warp" in map(kind_of_words, names):
+            return False
+        if any(DATA & set(words(name)) for name in names):
+            return "render" not in map(role_of_words, names)
+        found = self.program.lookup(function, chain[-1])
+        return found is not None and self._holds_data(*found)
 
     # -- definitions
 

@@ -18,6 +18,7 @@ ORDER: Tuple[Rule, ...] = (
     names.Tracking(),
     names.EvaluationName(),
     steps.PoseStep(),
+    steps.OtherStep(),
     steps.NoStep(),
     other.NotSplats(),
 )

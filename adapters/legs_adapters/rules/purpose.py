@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from typing import Dict, List, Optional, Sequence, Set, Tuple
+from typing import Any, Callable, Dict, List, Optional, Sequence, Set, Tuple, TypeVar
 
 import libcst as cst
 
@@ -22,22 +22,24 @@ from legs_adapters.code.syntax import (
     call_name,
     constant,
     dotted,
+    walk_expressions,
     words,
     words_in,
 )
-from legs_adapters.lexicon.words import EMBEDDING, GAUSSIANS, MODELS, PLUMBING, POSES, TENSORS
+from legs_adapters.lexicon.words import EMBEDDING, GAUSSIANS, MODELS, PLUMBING, POSES, RENDERERS, TENSORS
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.operations import NEW_TENSORS
 from legs_adapters.tensors.steps import has_step, is_backward, is_step, may_step, reads_gradients
 from legs_adapters.terms.findings import Evidence
 
+_T = TypeVar("_T")
 _DEPTH = 3
 # With the optimiser, the words of whose method runs it, and the calls that made those.
 _Step = Tuple[Function, cst.Call, cst.BaseExpression, Set[str], List[Tuple[Function, cst.Call]]]
 _Value = Tuple[Function, cst.CSTNode]
-_Pass = Tuple[Optional[Evidence], Set[str]]  # that it trains no Gaussians, and the words of what is moved after it
 _STEPS = re.compile(r"step(?:(?!step)\w)*\s*\(")
 _CALLED = re.compile(r"\b(\w+)\s*\(")
+_SETS_RATES = re.compile(r"""\[["']lr["']\]\s*[-+*/]?=[^=]|add_param_group|CyclicLR|OneCycleLR""")
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 
 
@@ -47,12 +49,14 @@ class Purposes:
     def __init__(self, program: Program, training: Training) -> None:
         self.program = program
         self.training = training
-        self._passes: Dict[Tuple[Function, Tuple[int, ...], int], List[_Pass]] = {}  # once for the terms of a loop
+        self._known: Dict[Tuple[str, Function, Tuple[int, ...], int], Any] = {}
 
-    def purpose(self, function: Function, node: cst.CSTNode) -> Optional[Evidence]:
+    def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Evidence]:
         """Return the evidence that the backward pass of an expression trains no Gaussians; None where it may."""
-        found = [evidence for evidence, _ in self._passes_of(function, node)]
-        return found[0] if len({evidence and evidence.rule for evidence in found}) == 1 else None
+        score = self.training.scores(node)
+        if score is not None:
+            return Evidence("no-step", "scoring", [score])
+        return self._once(self._purpose, function, node, depth)
 
     def of_call(self, function: Function, node: cst.CSTNode, caller: Function, call: cst.Call) -> Optional[Evidence]:
         """Return the evidence that one call of a function trains no Gaussians: by its step, or optimiser."""
@@ -64,39 +68,39 @@ class Purposes:
         is_of_poses = bool(moved) and len(moved) == len(steps) and all(map(_are_poses, moved))
         return Evidence("pose-step", "tracking", [(caller, call)]) if is_of_poses else None
 
-    def moves_gaussians(self, function: Function, node: cst.CSTNode) -> bool:
+    def moves_gaussians(self, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
         """Return whether an optimiser that steps after the backward pass of an expression is known to have them."""
-        return any(moved & (GAUSSIANS | TENSORS) for _, moved in self._passes_of(function, node))
+        return self._once(self._moves, function, node, depth)
 
-    def _passes_of(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[_Pass]:
-        """Return the backward passes of an expression, in its function or in callers."""
-        score = self.training.scores(node)
-        if score is not None:
-            return [(Evidence("no-step", "scoring", [score]), set())]
-        known = function, tuple(map(id, function.flow.loops_around(node))), depth
-        if known not in self._passes:
-            found: List[_Pass] = []
-            if any(map(is_backward, function.flow.calls)):
-                found = [self._pass(function, *self._after(function, node))]
-            elif depth < _DEPTH:
-                sites = self.training.sites.get(function, [])
-                found = [each for caller, call in sites for each in self._passes_of(caller, call, depth + 1)]
-            self._passes[known] = found or [(None, set())]
-        return self._passes[known]
+    def _once(self, ask: Callable[..., _T], function: Function, node: cst.CSTNode, depth: int) -> _T:
+        """Ask once for the terms of a round of a loop: the step after them is the same."""
+        known = ask.__name__, function, tuple(map(id, function.flow.loops_around(node))), depth
+        if known not in self._known:
+            self._known[known] = ask(function, node, depth)
+        return self._known[known]
 
-    def _pass(self, function: Function, own: Optional[cst.Call], steps: List[_Step]) -> _Pass:
-        """Return what is known of a backward pass: of itself where no step follows it, else of the steps."""
-        leaves, moved = [self._moved_by(step) for step in steps], [self._moved(step) for step in steps]
-        found: Optional[Evidence] = None
+    def _moves(self, function: Function, node: cst.CSTNode, depth: int) -> bool:
+        if not any(map(is_backward, function.flow.calls)):
+            sites = self.training.sites.get(function, []) if depth < _DEPTH else []
+            return any(self.moves_gaussians(caller, call, depth + 1) for caller, call in sites)
+        return any(self._moved(step) & (GAUSSIANS | TENSORS) for step in self._after(function, node)[1])
+
+    def _purpose(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[Evidence]:
+        if not any(map(is_backward, function.flow.calls)):
+            sites = self.training.sites.get(function, []) if depth < _DEPTH else []
+            purposes = [self.purpose(caller, call, depth + 1) for caller, call in sites]
+            return purposes[0] if len({purpose and purpose.rule for purpose in purposes}) == 1 else None
+        own, steps = self._after(function, node)
         if own is not None:
-            found = Evidence("no-step", "scoring", [(function, own)])
-        elif steps and all(each == [] for each in leaves):
-            found = Evidence("no-step", "scoring", [steps[0][:2]])
-        elif steps and all(map(_are_poses, moved)):
-            found = Evidence("pose-step", "tracking", [steps[0][:2]])
-        elif steps and not any(some & MODELS for some in moved) and all(map(self._are_made, leaves)):
-            found = Evidence("", "nothing shows that its optimiser has Gaussians", [steps[0][:2]])
-        return found, set().union(*moved)
+            return Evidence("no-step", "scoring", [(function, own)])
+        moved, first = [self._moved(step) for step in steps], [step[:2] for step in steps[:1]]
+        if steps and all(self._moved_by(step) == [] for step in steps):
+            return Evidence("no-step", "scoring", first)
+        if steps and all(map(_are_poses, moved)):
+            return Evidence("pose-step", "tracking", first)
+        is_other = steps and not any(some & MODELS for some in moved) and all(map(self._is_beside, steps))
+        # What is drawn is asked last: it reads much that nothing else does.
+        return Evidence("other-step", "tracking", first) if is_other and self._draws_a_model(function, 0) else None
 
     def _after(self, function: Function, node: cst.CSTNode) -> Tuple[Optional[cst.Call], List[_Step]]:
         """Return the steps after the backward pass of an expression; and that pass, where none follows it."""
@@ -185,6 +189,16 @@ class Purposes:
         given = self._given(function, optimiser, makers)
         return [leaf for each in given for leaf in self._leaves(*each)] if given else None
 
+    def _is_still(self, node: cst.CSTNode) -> bool:
+        """Return whether it is a group of parameters with the rate 0, in a checkout that sets no rate later."""
+        literal = [each for each in getattr(node, "elements", ()) if isinstance(each, cst.DictElement)]
+        rates = [constant(each.value) for each in literal if constant(each.key) == "lr"]
+        return rates == [0] and not self._sets_rates()
+
+    @remembered
+    def _sets_rates(self) -> bool:
+        return any(_SETS_RATES.search(source.text) for source in self.program.sources.values())
+
     def _given(
         self, function: Function, optimiser: cst.CSTNode, makers: Sequence[Tuple[Function, cst.Call]], depth: int = 0
     ) -> List[_Value]:
@@ -222,25 +236,19 @@ class Purposes:
         given = [(by, where.given(maker, of.value)) for by, maker in of_class]
         return [(by, value) for by, value in given if value is not None]
 
-    def _are_made(self, leaves: Optional[List[_Value]]) -> bool:
-        """Return whether parameters are known, and are tensors that are made for the optimiser."""
-        given = [leaf for leaf in leaves or () if not isinstance(leaf[1], cst.SimpleString)]
-        return bool(given) and all(self._is_made(*leaf) for leaf in given)
-
-    def _is_made(self, function: Function, node: Optional[cst.CSTNode], depth: int = 0) -> bool:
-        """Return whether a value is a new tensor, ``nn.Parameter(torch.zeros(6))``, also by a name or a helper."""
-        made = [(where, each.value) for where, each in _definitions(self.program, function, node)] if node else []
-        calls = [part for part in attribute_chain(node) if isinstance(part, cst.Call)] if node else []
-        made += values_of(self.program, function, calls[-1]) if calls else []
-        is_new = any(call_name(call) in NEW_TENSORS for call in calls)
-        goes_on = bool(made) and depth <= _DEPTH
-        return is_new or (goes_on and all(self._is_made(*each, depth + 1) for each in made))
+    def _is_beside(self, step: _Step) -> bool:
+        """Return whether an optimiser has tensors alone that are made for it, none for each Gaussian."""
+        leaves = [leaf for leaf in self._moved_by(step) or () if not isinstance(leaf[1], cst.SimpleString)]
+        values: List[Tuple[Function, Optional[cst.CSTNode]]] = []
+        for leaf in leaves:
+            made = [(where, each.value) for where, each in _definitions(self.program, *leaf)]
+            values += made or [leaf]
+        return bool(leaves) and all(_is_own_tensor(self.program, *value) for value in values)
 
     def _leaves(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[_Value]:
         """Return the parameters in ``[{"params": [a, b]}, c]``, or in a name of such a list."""
-        literal = [each for each in getattr(node, "elements", ()) if isinstance(each, cst.DictElement)]
-        if any(constant(each.key) == "lr" and constant(each.value) == 0 for each in literal):
-            return []  # a group that stays
+        if self._is_still(node):
+            return []
         entries = self._within(function, node) if depth <= _DEPTH else []
         return [leaf for each in entries for leaf in self._leaves(*each, depth + 1)] if entries else [(function, node)]
 
@@ -262,6 +270,15 @@ class Purposes:
         elif isinstance(node, cst.Call) and call_name(node) == "list":
             entries = [arg.value for arg in node.args]
         return [(function, each) for each in entries if each is not None]
+
+    @remembered
+    def _draws_a_model(self, function: Function, depth: int) -> bool:
+        """Return whether a function gives a renderer Gaussians by their name, or calls one that does."""
+        calls = function.flow.calls
+        if any(set(words(call_name(call))) & RENDERERS and words_in(call) & GAUSSIANS for call in calls):
+            return True
+        inner = (each for call in calls for each in callees(self.program, function, call))
+        return depth < 2 and any(self._draws_a_model(each, depth + 1) for each in inner)
 
 
 def _are_poses(moved: Set[str]) -> bool:
@@ -298,3 +315,18 @@ def _entries(value: Optional[cst.CSTNode]) -> List[Optional[cst.CSTNode]]:
     if isinstance(value, (cst.Dict, cst.List, cst.Tuple)):
         return [element.value for element in value.elements]
     return [value.elt if isinstance(value, cst.ListComp) else value.value if isinstance(value, cst.DictComp) else value]
+
+
+def _is_own_tensor(program: Program, function: Function, value: Optional[cst.CSTNode]) -> bool:
+    """Return whether a value is a new tensor, also by a helper, whose values and sizes are none of Gaussians."""
+    made = [part for part in attribute_chain(value) if isinstance(part, cst.Call)] if value is not None else []
+    if not made:
+        return False
+    sizes = [part for arg in made[-1].args for part in walk_expressions(arg.value)]
+    sizes += [each for part in sizes for each in function.flow.assigned(part)]
+    counts = [part for part in sizes if isinstance(part, cst.Call) and call_name(part) == "len"]
+    if words_in(*sizes) & TENSORS or words_in(*counts) & GAUSSIANS:
+        return False
+    helpers = values_of(program, function, made[-1])
+    of_helpers = bool(helpers) and all(_is_own_tensor(program, *helper) for helper in helpers)
+    return call_name(made[-1]) in NEW_TENSORS or of_helpers

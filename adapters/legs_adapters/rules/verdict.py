@@ -158,10 +158,8 @@ class Verdicts:
         made = self._unknown_maker(term.function, term.target)
         if made is not None:
             return f"nothing shows what {one_line(made)} makes of the photograph"
-        if self._is_unknown_entry(term.function, term.prediction):
-            return f"nothing shows which pictures {prediction} takes"
-        purpose = self.analysis.purposes.purpose(term.function, term.form.call)
-        return "" if purpose is None else purpose.reason
+        is_told = not self._is_unknown_entry(term.function, term.prediction)
+        return "" if is_told else f"nothing shows which pictures {prediction} takes"
 
     def _unknown_maker(self, function: Function, target: cst.BaseExpression) -> Optional[cst.Call]:
         """Return what makes a target of a photograph, ``teacher(photo)``, where nothing shows what that does."""
@@ -178,6 +176,9 @@ class Verdicts:
                     return node
                 returned = values_of(self.analysis.program, where, node)
                 parts = [*given, *attribute_chain(node.func)] if call_name(node) in KEEPS_PICTURES else []
+            elif isinstance(node, cst.BinaryOperation):  # photo * segment(photo): a mask
+                shown = [part for part in parts if meaning(where, part) == PHOTOGRAPH]
+                parts = [part for part in parts if len(shown) < 2 or not isinstance(part, cst.Call)]
             pictures = [(where, part) for part in parts if meaning(where, part).kind in (None, "image")]
             goes_on = where.module.spend(1 + len(parts)) and len(work) < _MOST
             work += [each for each in pictures + returned if each not in work] if goes_on else []

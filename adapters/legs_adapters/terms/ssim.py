@@ -73,6 +73,9 @@ def _form(program: Program, function: Function, functions: List[Function]) -> Op
     node = function.node
     if not isinstance(node, cst.FunctionDef) or function.owner is not None or function.decorators:
         return None
+    with_keywords = [call.func for call in function.flow.calls if any(arg.keyword for arg in call.args)]
+    if any(_called(program, function, called) for called in with_keywords):
+        return None  # a keyword is a name of the other function's
     node = node.with_changes(body=function.body, leading_lines=())
     if node.get_docstring(clean=False) is not None:
         node = node.with_changes(body=function.body.with_changes(body=function.body.body[1:]))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, AbstractSet, List
 
+from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import names_where, root_of, words
 from legs_adapters.lexicon.words import (
     EVALUATING,
@@ -21,7 +23,7 @@ from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
 
 if TYPE_CHECKING:
-    pass
+    from legs_adapters.rules.analysis import Analysis
 
 
 class Tracking(Rule):
@@ -96,7 +98,7 @@ class OtherName(Rule):
         if self.id == "robust":
             return term.form.makes != "none"
         is_step = term.function in term.analysis.training.roots  # its name says nothing of one term in it
-        return self.id != "perceptual" or is_step
+        return self.id != "perceptual" or is_step or _are_proven(term.analysis, term.function)
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether the name may mean something else: it is reported where no other term was found."""
@@ -109,6 +111,12 @@ NAMES = (
     OtherName("mesh", "mesh", MESH, "A name is of a mesh: nothing proves that Gaussians are drawn.", "train_texture"),
     OtherName("robust", "huber", ROBUST, "A name is of a robust loss: a weight may move its threshold.", "huber"),
 )
+
+
+@functools.lru_cache(maxsize=1)
+def _are_proven(analysis: Analysis, function: Function) -> bool:
+    """Return whether both sides of each term of a function are proven."""
+    return all(Term(analysis, function, form).pair.is_proven for form in analysis.forms.in_function(function))
 
 
 def _is_of_tracking(name: str) -> bool:

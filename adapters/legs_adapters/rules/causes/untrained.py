@@ -6,7 +6,8 @@ from typing import AbstractSet, Iterator, List
 
 from legs_adapters.code.calls import likely_calls
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import attribute_chain, call_name, words
+from legs_adapters.code.program import Program
+from legs_adapters.code.syntax import attribute_chain, call_name, code, words
 from legs_adapters.lexicon.words import LOSS, REPORTING, SCORING
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.tensors.gradients import is_detached, no_grad_around
@@ -72,10 +73,10 @@ class Untrained(Rule):
 
         A gradient that is cut of it, ``error = l1_loss(image, gt).detach()``, makes a weight or a number.
         """
-        training, function = term.analysis.training, term.function
+        program, training, function = term.analysis.program, term.analysis.training, term.function
         cuts = [call for call in function.flow.calls if call_name(call) in ENDS_GRADIENT]
         is_cut = any(term.form.node in attribute_chain(call) for call in cuts)
-        return not is_cut and not training.touches(function)
+        return not is_cut and not training.touches(function) and _may_run(program, function, 3)
 
 
 UNTRAINED = (Scoring(), Evaluation(), Untrained())
@@ -90,6 +91,20 @@ def _is_untrained(term: Term) -> bool:
     without = bool(sites) and all(no_grad_around(caller, call) for caller, call in sites)
     without = without or no_grad_around(term.function, form.call, form.node) is not None or is_detached(term.prediction)
     return without or not trained or is_measured(term.function, form)
+
+
+def _may_run(program: Program, function: Function, depth: int) -> bool:
+    """Return whether something names a function, and is no function that nothing names."""
+    if function.owner is not None or function.decorators or not function.name or depth == 0:
+        return True
+    others = (each for each in program.mentioning(function.name) if each is not function)
+    return any(_names(each, function.name) and _may_run(program, each, depth - 1) for each in others)
+
+
+def _names(function: Function, name: str) -> bool:
+    """Return whether a function, or the top level of a file, reads, calls or imports a name."""
+    flow, said = function.flow, [code(node) for node in function.flow.imports]
+    return any(name in each for each in said) or name in {*map(call_name, flow.calls), *(r.value for r in flow.reads)}
 
 
 def _is_called_by_framework(term: Term) -> bool:

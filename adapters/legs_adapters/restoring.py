@@ -69,6 +69,9 @@ def _pattern(text: bytes) -> re.Pattern[bytes]:
     words = [re.escape(word) for word in _TOKEN.findall(_LAST_COMMA.sub(b"", text))]
     words = [re.sub(rb"['\"]", rb"['\"]", word) if word.endswith((b"'", b'"')) else word for word in words]
     words = [_COMMA + word if word.endswith((b")", b"]", b"}")) else word for word in words]
+    if b"lambda" in words:  # ruff puts its body in brackets: to the text's end, or to the call's
+        words[words.index(b":", words.index(b"lambda"))] += rb"\s*(?P<open>\()?"
+        words.insert(len(words) - (words[0] != b"lambda"), rb"(?(open)\))")
     return re.compile(rb"(?<![\w.])" + _FREE.join(words) + rb"(?!\w)")
 
 

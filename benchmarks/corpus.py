@@ -31,7 +31,7 @@ from benchmarks import ablation
 
 Plan = Dict[str, Any]
 CONTEXT = multiprocessing.get_context("forkserver" if hasattr(os, "fork") else "spawn")
-LOADED = ["libcst", "legs_adapters.cli", "benchmarks.ablation"]  # once, in the process that the others are forked from
+LOADED = ["legs_adapters.cli", "benchmarks.ablation"]  # once, in the process that the others are forked from
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:

@@ -33,7 +33,6 @@ PACKAGES = (
     "PIL.PngImagePlugin",
     "numba",
     "matplotlib.figure",
-    "libcst",
 )
 
 

@@ -43,7 +43,6 @@ def test_a_path_of_the_project_that_a_page_names_is_there(page: Path) -> None:
 
 
 def test_an_option_that_a_page_gives_to_a_command_is_one_of_it(capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("libcst")
     known: Dict[str, Set[str]] = {}
     for page in PAGES:
         for name, other, words in re.findall(

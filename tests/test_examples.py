@@ -34,7 +34,6 @@ def test_the_training_loop_learns():
 @pytest.mark.slow
 def test_arms_are_trained_milestone_by_milestone(tiny_scene, tmp_path):
     pytest.importorskip("numba")
-    pytest.importorskip("libcst")
     examples = ROOT / "examples" / "reproduce_paper"
     words = [tiny_scene, tmp_path / "cpu", "--until", "1000", "-r", "24", "--arms", "3dgs@legs"]
     python(examples / "schedule.py", *words)

@@ -40,7 +40,6 @@ def test_no_module_has_the_name_of_a_function() -> None:
 
 
 def test_patching_does_not_wait_for_torch(tmp_path: Path) -> None:
-    pytest.importorskip("libcst")
     script = tmp_path / "train.py"
     script.write_text(
         "import torch\nfrom gaussian_renderer import render\nfrom utils.loss_utils import l1_loss\n\n\n"

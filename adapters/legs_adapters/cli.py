@@ -65,16 +65,17 @@ def _so_far(args: argparse.Namespace) -> str:
     return "; the patch was already undone" if args.undo else undo_it
 
 
-def check_libcst() -> None:
-    """Raise a LegsError that says how to install LibCST where it is missing."""
-    require("legs-patch", "patch", "libcst")
+def check_parser() -> None:
+    """Raise a LegsError that says how to install what Python 3.7 needs to parse, where it is missing."""
+    if sys.version_info < (3, 8):
+        require("legs-patch", "patch", "asttokens")
 
 
 def _run(args: argparse.Namespace) -> int:
     args.before = _journal(args.folder)
     if args.undo and (args.check or args.verify):
         raise LegsError("--undo can be combined with --diff and --force only")
-    check_libcst()
+    check_parser()
     if args.verify:
         require("legs-patch --verify", "cpu", "numba", "scipy")
     if args.undo:

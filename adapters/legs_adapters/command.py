@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-from legs_adapters.cli import check_libcst
+from legs_adapters.cli import check_parser
 from legs_loss.errors import require
 
 HELP = "run a training script with the LEGS loss, without changing its files"
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the script and return its exit code."""
-    check_libcst()
+    check_parser()
     if args.cpu:
         require("legs run --cpu", "cpu", "numba", "scipy")
     from legs_adapters.runner import run_script

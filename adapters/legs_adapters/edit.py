@@ -11,15 +11,14 @@ An edit never changes the number of lines of the expression it replaces: comment
 
 from __future__ import annotations
 
+import ast
 import itertools
 import sys
 from typing import List, Optional, Sequence
 
-import libcst as cst
-
 from legs_adapters.code.module import Module
 from legs_adapters.code.parsing import read_by_python
-from legs_adapters.code.syntax import dotted
+from legs_adapters.code.syntax import FUNCTIONS, constant
 from legs_adapters.terms.findings import Findings
 from legs_adapters.terms.text import Edit, Text, apply_edits
 from legs_adapters.terms.writing import PACKAGE
@@ -35,7 +34,7 @@ def rewrite(findings: Findings, path: str, in_place: bool = False) -> List[Edit]
 
     Raises:
         LegsError: the file has a legs_loss of its own; or the result would not compile (a bug of legs-patch).
-        ValueError: this Python cannot compile the file, or it cannot be written back exactly.
+        ValueError: this Python cannot compile the file.
     """
     source, module = findings.program.sources[path], findings.program.module(path)
     assert module is not None
@@ -58,7 +57,7 @@ def rewrite(findings: Findings, path: str, in_place: bool = False) -> List[Edit]
 
 
 def why_not_compiled(data: bytes) -> str:
-    """Return why this Python cannot compile a file, or "": LibCST also reads syntax of other versions."""
+    """Return why this Python cannot compile a file, or ""."""
     made = read_by_python(data, flags=0)
     version = ".".join(map(str, sys.version_info[:2]))
     return f"Python {version} cannot compile it: {made}" if isinstance(made, Exception) else ""
@@ -66,26 +65,25 @@ def why_not_compiled(data: bytes) -> str:
 
 def _import(text: Text) -> Edit:
     """Return the edit that imports the package."""
-    module, body = text.module, text.module.outline.tree.body
+    module, body = text.module, text.module.top.body
     line = f"import {PACKAGE}"
-    newline = module.outline.tree.default_newline
+    newline = "\r\n" if b"\r\n" in text.bytes else "\n"
     anchor = _anchor(body)
     if anchor is None:
-        first = [module.top.place(node).line for part in body[:1] for node in (part, *getattr(part, "decorators", ()))]
-        at = module.lines.start(min(first)) if first else len(text.bytes)
+        first = [node for part in body[:1] for node in (part, *getattr(part, "decorator_list", ()))]
+        lines = [module.top.place(node, True).line for node in first]
+        at = module.lines.start(min(lines)) if lines else len(text.bytes)
         return text.replace(at, at, line + newline)
     at = len(text.bytes[: module.lines.start(module.top.place(anchor).last_line + 1)].rstrip(b"\r\n"))
     return text.replace(at, at, newline + line)
 
 
-def _anchor(body: Sequence[cst.CSTNode]) -> Optional[cst.SimpleStatementLine]:
+def _anchor(body: Sequence[ast.stmt]) -> Optional[ast.AST]:
     """Return the statement that the import goes after: the last import above functions and classes, or a docstring."""
-    top = itertools.takewhile(lambda each: not isinstance(each, (cst.FunctionDef, cst.ClassDef)), body)
-    lines = [each for each in top if isinstance(each, cst.SimpleStatementLine)]
-    first = lines[0].body[0] if lines and lines[0] is body[0] else None
-    is_doc = isinstance(first, cst.Expr) and isinstance(first.value, (cst.SimpleString, cst.ConcatenatedString))
-    imports = [each for each in lines if isinstance(each.body[0], (cst.Import, cst.ImportFrom))]
-    return imports[-1] if imports else lines[0] if is_doc else None
+    top = itertools.takewhile(lambda each: not isinstance(each, (*FUNCTIONS, ast.ClassDef)), body)
+    imports = [each for each in top if isinstance(each, (ast.Import, ast.ImportFrom))]
+    doc = [each for each in body[:1] if isinstance(each, ast.Expr) and isinstance(constant(each.value), str)]
+    return next(iter(imports[-1:] or doc), None)
 
 
 def _is_imported(module: Module) -> bool:
@@ -96,6 +94,6 @@ def _is_imported(module: Module) -> bool:
     """
     scopes = list(module.scopes(lambda text: PACKAGE in text))
     for node in [made.node for scope in scopes for made in scope.flow.definitions.get(PACKAGE, [])]:
-        if not isinstance(node, cst.ImportAlias) or (dotted(node.name) or "").split(".")[0] != PACKAGE:
+        if not isinstance(node, ast.alias) or node.name.split(".")[0] != PACKAGE:
             raise LegsError(f"{module.path} has a {PACKAGE} of its own: rename it, or skip the file with --exclude")
     return PACKAGE in module.top.flow.definitions

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Iterable, Sequence
 
@@ -12,8 +11,6 @@ from benchmarks.gpu.options import Skipped
 
 __all__ = ["missing", "need"]
 
-OURS = ("libcst",)  # what `legs run` itself needs
-
 
 def need(scripts: Sequence[Path], built: Iterable[str] = ()) -> None:
     """Check that `legs run` can run a codebase's scripts; arguments as for :func:`missing`.
@@ -22,6 +19,5 @@ def need(scripts: Sequence[Path], built: Iterable[str] = ()) -> None:
         Skipped: they cannot; the message names the packages.
     """
     lacking = sorted({name for script in scripts for name in missing(script, built)})
-    lacking += [name for name in OURS if importlib.util.find_spec(name) is None]
     if lacking:
         raise Skipped(f"{scripts[0].name} needs what is not installed: {', '.join(lacking)}")

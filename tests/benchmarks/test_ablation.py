@@ -11,7 +11,6 @@ from typing import Any, Dict, List, Tuple
 
 import pytest
 
-pytest.importorskip("libcst")
 if not hasattr(os, "fork"):
     pytest.skip("no os.fork", allow_module_level=True)
 

@@ -11,8 +11,6 @@ from typing import Any, Dict
 
 import pytest
 
-pytest.importorskip("libcst")
-
 from benchmarks import corpus
 from tests import preloaded
 from tests.patcher.support import checkout

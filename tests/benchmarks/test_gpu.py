@@ -17,7 +17,6 @@ import pytest
 import torch
 
 pytest.importorskip("numba")
-pytest.importorskip("libcst")
 
 from benchmarks.gpu import aims, building, imports, measured
 from benchmarks.gpu.__main__ import MINUTES

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import libcst as cst
+import ast
+
 from legs_adapters.code.program import Program
 from legs_adapters.code.sources import Source
 from legs_adapters.code.syntax import code
@@ -29,7 +30,7 @@ def function(made, name):
 
 def read(where, name):
     """Return the last read of a name in a function."""
-    return [node for node in where.flow.reads if node.value == name][-1]
+    return [node for node in where.flow.reads if node.id == name][-1]
 
 
 def call(where, text):
@@ -39,5 +40,5 @@ def call(where, text):
 
 def values(definitions):
     """Return the definitions that reach a place, as text: the value, or the kind where there is none."""
-    said = [d.kind if not isinstance(d.value, cst.BaseExpression) else code(d.value) for d in definitions]
+    said = [d.kind if not isinstance(d.value, ast.expr) else code(d.value) for d in definitions]
     return sorted(said)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
-pytest.importorskip("libcst")
-
 from legs_adapters.code.syntax import code
 from legs_adapters.tensors.backward import Training
 
@@ -33,7 +30,7 @@ CASES = {
 def trained(text):
     """Return the texts of the calls that a backward pass reaches."""
     made = program(text)
-    training = Training(made, lambda text: True)
+    training = Training(made)
     return {code(call) for where in scopes(made) for call in where.flow.calls if training.includes(call)}
 
 

@@ -8,9 +8,6 @@ from pathlib import Path
 import legs_adapters
 import pytest
 import torch
-
-pytest.importorskip("libcst")
-
 from legs_adapters.lexicon import words
 from legs_adapters.lexicon.names import is_l1_name, kind_of_words, role_of_words
 from legs_adapters.tensors import operations

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 
-import pytest
-
-pytest.importorskip("libcst")
-
 from legs_adapters.code.module import Module
 from legs_adapters.code.questions import Questions
 from legs_adapters.code.reaching import Definition, Reaching

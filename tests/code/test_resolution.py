@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
-pytest.importorskip("libcst")
-
 from legs_adapters.code.module import Class, Function
 
 from tests.code.support import function, program

@@ -11,9 +11,6 @@ import sys
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("libcst")
-
 from legs_adapters import verify as verifying
 from legs_adapters.cli import main
 from legs_adapters.journal import JOURNAL
@@ -121,7 +118,7 @@ def look(root, _, command, *others):
     return run_of_none()._replace(code=0 if patched == wanted else 1)
 
 
-# Added to a training script: what LibCST reads, all or in part, and Python does not compile.
+# Added to a training script: what Python does not compile.
 NOT_COMPILED = {
     "Python 2's except": "try:\n    x = 1\nexcept ValueError, error:\n    pass\n",
     "a statement cut short": "x = 1 2\n",

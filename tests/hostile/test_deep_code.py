@@ -8,8 +8,6 @@ import textwrap
 
 import pytest
 
-pytest.importorskip("libcst")
-
 from tests.patcher.support import checkout, files, legs_patch
 from tests.support import legs_environment
 
@@ -42,7 +40,7 @@ CASES = {
     "brackets in a string": ("x = '" + ") (" * 400 + "'", ""),
     "5 MB of literal": ("x = [" + "1.25, " * 900_000 + "]", "larger than 1 MiB"),
     "900 kB of literal": ("x = [" + "1.25, " * 150_000 + "]", STEPS),
-    "130,000 statements": ("a\n" * 130_000, STEPS),
+    "130,000 statements": ("a\n" * 130_000, ""),
     "8,000 small functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(8000)), STEPS),
     "3,000 trained terms": (
         "def f(a, b):\n" + "    l1 = l1_loss(render(a)['render'], b.original_image); l1.backward()\n" * 3000,
@@ -57,7 +55,7 @@ CASES = {
     "20,000 signs": ("x = " + "-" * 20_000 + "a", PARTS),
     "20,000 strings": ("x = " + " ".join(["'l1_loss'"] * 20_000), PARTS),
     "20,000 choices": ("x = " + "1 if a else " * 20_000 + "1", PARTS),
-    "20,000 lambdas": ("x = " + "lambda a, b: " * 20_000 + "1", "more than 660 lambdas"),
+    "20,000 lambdas": ("x = " + "lambda a, b: " * 20_000 + "1", ""),
     "20,000 lines": ("x = 1 + \\\n" * 20_000 + "1", PARTS),
     "a field of 20,000 parts": ("x = f'{" + "+".join(["a"] * 20_000) + "}'", PARTS),
     "a list of 10,000 parts": ("x = [" + ", ".join(["-a.b[0]"] * 10_000) + "]", ""),
@@ -122,10 +120,10 @@ def test_files_that_are_too_much_together(tmp_path, monkeypatch, capsys):
         assert main(["--check", str(root)]) == 2
         assert " MiB: leave some out by --exclude" in capsys.readouterr().err
     with monkeypatch.context() as patch:
-        patch.setattr(limits, "MAX_FILE_STEPS", 50_000)
+        patch.setattr(limits, "MAX_FILE_STEPS", 20_000)
         assert sorted(unread()) == ["a.py", "z.py"]
     with monkeypatch.context() as patch:
-        patch.setattr(limits, "MAX_STEPS", 100_000)
+        patch.setattr(limits, "MAX_STEPS", 30_000)
         found = unread()
     assert "z.py" in found and "a.py" not in found
     assert "all files together take more than" in found["z.py"] and "leave others out by --exclude" in found["z.py"]
@@ -153,9 +151,9 @@ LABORIOUS = {
     "a sum of 100 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 100)), True),
     "a sum of 601 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 601)), True),
     "650 lambdas": ("def f():\n    g = " + "lambda: " * 650 + "0\n", True),
-    "1,500 lambdas": ("def f():\n    g = " + "lambda: " * 1500 + "0\n", False),
+    "1,500 lambdas": ("def f():\n    g = " + "lambda: " * 1500 + "0\n", True),
     "1,000 functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(1000)), True),
-    "9,000 functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(9000)), False),
+    "9,000 functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(9000)), True),
     "400 branches": (step("if c:\n    image = image * gt\nelse:\n    gt = gt + image\n" * 400), True),
     "1,800 loops": (step("for x in c:\n    image = image + gt\n" * 1800), True),
     "1,200 try": (step("try:\n    image = image + gt\nexcept ValueError:\n    gt = image\n" * 1200), True),
@@ -195,27 +193,20 @@ def test_the_steps_are_few(what, options, tmp_path):
     assert int(kilobytes) < 300 << 10
 
 
-def test_many_files_cost_what_each_costs_and_few_bodies_are_parsed(tmp_path, monkeypatch):
-    """Ten copies of a checkout: ten times the steps, and of each only the bodies through which an L1 may be reached."""
-    from legs_adapters.code import module as read
+def test_many_files_cost_what_each_costs(tmp_path):
+    """Ten copies of a checkout: ten times the steps."""
     from legs_adapters.plan import plan
 
-    parsed, real = [], read.body_part
-    monkeypatch.setattr(read, "body_part", lambda lines, cut: parsed.append(lines.data[cut]) or real(lines, cut))
     unlike = "".join(f"def tool{i}(a, b):\n    return np.abs(a * {i}) + run(a, 'train', b)\n\n\n" for i in range(50))
     texts = {"train.py": TRAIN, "utils/tools.py": unlike, **{k: v for k, v in files("common").items() if "/" in k}}
 
     def steps(copies):
-        parsed.clear()
         root = tmp_path / str(copies)
         found = plan(checkout(root, {f"c{i}/{path}": text for i in range(copies) for path, text in texts.items()}))
         assert len(found.after) == copies
         return found.findings.program.budget._of_all[0]
 
-    one = steps(1)
-    assert not any(b"tool" in body or b"np.abs" in body for body in parsed)
-    each = len(parsed)
-    assert steps(10) <= 10.5 * one and len(parsed) == 10 * each
+    assert steps(10) <= 10.5 * steps(1)
 
 
 def test_submodules_are_planned_under_the_one_budget(tmp_path, monkeypatch, capsys):
@@ -225,7 +216,7 @@ def test_submodules_are_planned_under_the_one_budget(tmp_path, monkeypatch, caps
     root = beside(tmp_path, {"third_party/gs/train.py": TRAIN + "# gaussian splatting\n"})
     assert main(["--check", str(root)]) == 1
     assert "third_party/gs/train.py:9 may be the loss" in capsys.readouterr().err
-    monkeypatch.setattr(limits, "MAX_STEPS", 5_000)
+    monkeypatch.setattr(limits, "MAX_STEPS", 2_000)
     assert main(["--check", str(root)]) == 1
     assert "third_party/gs/train.py:1 may be the loss" in capsys.readouterr().err  # unread, and said
 

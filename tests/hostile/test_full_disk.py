@@ -77,7 +77,6 @@ def one_error(capsys, code):
 
 @pytest.mark.parametrize("room", [0, 4096, 8192])
 def test_patch_and_undo(room, disk, tmp_path, capsys, monkeypatch):
-    pytest.importorskip("libcst")
     from legs_adapters.cli import main as legs_patch
 
     from tests.patcher.support import checkout, files
@@ -240,7 +239,6 @@ def test_masks_and_export(room, disk, tmp_path, capsys):
 @pytest.mark.parametrize("what", ["--verify", "--trace"])
 def test_a_full_folder_of_temporary_files(what, disk, tmp_path, capsys, monkeypatch):
     """It holds the copies and the reports of a run: one error, and nothing stays there."""
-    pytest.importorskip("libcst")
     pytest.importorskip("numba")
     from legs_adapters.cli import main as legs_patch
 

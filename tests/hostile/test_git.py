@@ -6,9 +6,6 @@ import os
 import subprocess
 
 import pytest
-
-pytest.importorskip("libcst")
-
 from legs_adapters.checkout import git as asking
 
 from tests.hostile.test_journal import attack, run

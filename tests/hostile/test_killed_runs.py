@@ -10,7 +10,6 @@ import time
 
 import pytest
 
-pytest.importorskip("libcst")
 pytest.importorskip("numba")
 
 from legs_loss import LegsError

@@ -80,7 +80,6 @@ def megabytes():
 @pytest.mark.slow
 def test_a_checkout_of_3000_files(tmp_path):
     """Some 15 s of CPU and 230 MB a command: each of its 301 trainings is weighted, and undone."""
-    pytest.importorskip("libcst")
     theirs = files("inria")
     names = {i: f"package{i // 60}/folder{i % 7}/module{i}.py" for i in range(3000)}
     texts = {name: theirs["train.py"] if i % 10 == 0 else HELPER.format(i) for i, name in names.items()}

@@ -7,7 +7,6 @@ import pytest
 from examples.reproduce_paper.compare import main
 from tests.lab.experiments.miniature import write_miniature
 
-pytest.importorskip("libcst")
 pytest.importorskip("numba")
 
 TRAIN = "train.py -s {scene} -m {output}"

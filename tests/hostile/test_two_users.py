@@ -10,9 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-
-pytest.importorskip("libcst")
-
 from legs_adapters.cli import main as legs_patch
 
 import legs_loss

@@ -6,10 +6,6 @@ import difflib
 import random
 import re
 
-import pytest
-
-pytest.importorskip("libcst")
-
 from legs_adapters.checkout.comparing import compared, unified_diff
 
 HUNK = re.compile(r"@@ -(\d+)(?:,(\d+))? \+(\d+)(?:,(\d+))? @@\n")

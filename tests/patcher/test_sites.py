@@ -7,6 +7,7 @@ import re
 import pytest
 from legs_adapters.code.sources import decode
 from legs_adapters.plan import plan
+from legs_adapters.terms.findings import Line
 from legs_adapters.terms.functions import L1Functions
 
 from legs_loss import LegsError
@@ -258,7 +259,7 @@ def test_a_method_is_not_resolved_by_its_bare_name(tmp_path):
         "        loss = ", "        extra = lpips_model.forward(image, gt_image)\n        loss = extra + ", 1
     )
     found = plan(checkout(tmp_path, texts)).findings
-    assert [site.form.callee.value for site in found.sites] == ["l1_loss"]
+    assert [site.form.callee.id for site in found.sites] == ["l1_loss"]
     assert found.problems == []
 
 
@@ -276,8 +277,25 @@ def test_a_perceptual_loss_is_no_l1_by_its_name_or_its_class(tmp_path, kind, att
     )
     texts["train.py"] = texts["train.py"].replace("import torch\n", "import torch\nfrom losses import Losses\n", 1)
     found = plan(checkout(tmp_path, texts)).findings
-    assert [site.form.callee.value for site in found.sites] == ["l1_loss"]
+    assert [site.form.callee.id for site in found.sites] == ["l1_loss"]
     assert found.problems == []
+
+
+def test_a_function_that_is_passed_by_name_is_left_where_that_name_stands(tmp_path):
+    """Its call stands in another file, and has more lines before it."""
+    texts = files("inria")
+    texts["losses.py"] = (
+        "from utils.loss_utils import l1_loss, l2_loss\n\n\nclass Losses:\n    def __init__(self, kind):\n"
+        "        if kind:\n            self.compare = l1_loss\n        else:\n            self.compare = l2_loss\n"
+    )
+    texts["codes.py"] = "# splats\n" * 40 + (
+        "from losses import Losses\n\n\ndef training(model, cams):\n    losses = Losses(1)\n    for cam in cams:\n"
+        "        loss = losses.compare(model.code(cam), cam.code)\n        loss.backward()\n"
+    )
+    found = plan(checkout(tmp_path, texts)).findings
+    (left,) = [entry for entry in found.left if entry.path == "losses.py"]
+    assert (left.line, left.text, left.rule) == (7, "self.compare = l1_loss", "unknown")
+    assert left.because == (Line("losses.py", 7, "self.compare = l1_loss"),)
 
 
 def test_depth_by_another_name_is_left(tmp_path):

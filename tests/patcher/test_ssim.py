@@ -5,9 +5,6 @@ from __future__ import annotations
 import json
 
 import pytest
-
-pytest.importorskip("libcst")
-
 from legs_adapters.plan import plan
 from legs_adapters.terms.ssim import FORMS, form_of
 

@@ -8,9 +8,6 @@ import pkgutil
 import re
 
 import pytest
-
-pytest.importorskip("libcst")
-
 from legs_adapters.plan import plan
 from legs_adapters.report import as_table
 from legs_adapters.terms import kinds

@@ -154,7 +154,6 @@ if __name__ == "__main__":
 @pytest.fixture(scope="module")
 def codebase(tmp_path_factory):
     """A checkout that patches cleanly, its patched copy, and a scene whose four views have stored maps."""
-    pytest.importorskip("libcst")
     if not torch.distributed.is_available():
         pytest.skip("torch was built without torch.distributed")
     folder = tmp_path_factory.mktemp("distributed")

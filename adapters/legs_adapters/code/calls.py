@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 from itertools import islice
 from typing import Iterator, List, Optional, Tuple
-
-import libcst as cst
 
 from legs_adapters.code.module import Class, Function
 from legs_adapters.code.program import Program, Reference
 
-_Call = Tuple[Function, cst.Call]  # with the function that it stands in
+_Call = Tuple[Function, ast.Call]  # with the function that it stands in
 
 
 def _named(program: Program, function: Function, most: Optional[int] = None) -> Iterator[_Call]:
@@ -20,7 +19,7 @@ def _named(program: Program, function: Function, most: Optional[int] = None) -> 
             yield from ((caller, call) for call in caller.flow.calls_of.get(function.name, ()))
 
 
-def _resolved(program: Program, caller: Function, node: cst.CSTNode) -> List[object]:
+def _resolved(program: Program, caller: Function, node: ast.AST) -> List[object]:
     return [reference.target for reference in program.resolve(caller, node)]
 
 
@@ -39,34 +38,32 @@ def sure_calls(program: Program, function: Function) -> Iterator[_Call]:
             yield caller, call
 
 
-def callees(program: Program, function: Function, call: cst.Call) -> List[Function]:
+def callees(program: Program, function: Function, call: ast.Call) -> List[Function]:
     """Return the functions of the checkout that a call resolves to for certain, without those of instances."""
     return [target for target in _resolved(program, function, call.func) if isinstance(target, Function)]
 
 
-def values_of(program: Program, function: Function, node: Optional[cst.CSTNode]) -> List[Tuple[Function, cst.CSTNode]]:
+def values_of(program: Program, function: Function, node: Optional[ast.AST]) -> List[Tuple[Function, ast.AST]]:
     """Return what the functions return that an expression calls for certain, each value with its function."""
-    runs = callees(program, function, node) if isinstance(node, cst.Call) else []
+    runs = callees(program, function, node) if isinstance(node, ast.Call) else []
     return [(run, value) for run in runs for value in run.flow.returns]
 
 
-def given_to(
-    program: Program, function: Function, parameter: str
-) -> Iterator[Tuple[Function, Optional[cst.BaseExpression]]]:
+def given_to(program: Program, function: Function, parameter: str) -> Iterator[Tuple[Function, Optional[ast.expr]]]:
     """Yield callers of a function's name, each with its argument for a parameter, None where it is missing."""
     return ((caller, function.given(call, parameter)) for caller, call in _named(program, function))
 
 
-def handed(program: Program, function: Function, node: cst.CSTNode) -> List[Reference]:
+def handed(program: Program, function: Function, node: ast.AST) -> List[Reference]:
     """Return what callers pass for the parameter that is called: ``model(batch)``, ``model.loss(batch)``."""
-    receiver = node.value if isinstance(node, cst.Attribute) else node
+    receiver = node.value if isinstance(node, ast.Attribute) else node
     kinds = {definition.kind for definition in function.flow.reaching(receiver)}
-    if not function.name or not isinstance(receiver, cst.Name) or kinds - {"store"} != {"parameter"}:
+    if not function.name or not isinstance(receiver, ast.Name) or kinds - {"store"} != {"parameter"}:
         return []
-    given = [(caller, value) for caller, value in given_to(program, function, receiver.value) if value is not None]
+    given = [(caller, value) for caller, value in given_to(program, function, receiver.id) if value is not None]
     found = [reference for caller, value in given for reference in program.resolve(caller, value)]
     instances = [reference for reference in dict.fromkeys(found) if reference.kind == "instance"]
-    if not isinstance(node, cst.Attribute):
+    if not isinstance(node, ast.Attribute):
         return instances
     owners = [reference.target for reference in instances if isinstance(reference.target, Class)]
-    return [reference for owner in owners for reference in program.member(owner, node.attr.value)]
+    return [reference for owner in owners for reference in program.member(owner, node.attr)]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import PurePosixPath
 from typing import Callable, Dict, Iterable, Iterator, List, Optional
 
-import libcst as cst
-
 from legs_adapters.code.limits import Budget, remembered
 from legs_adapters.code.module import Class, Function, Module, index_by_word, parse
 from legs_adapters.code.sources import Source, Unreadable
-from legs_adapters.code.syntax import dotted
 
 
 class Checkout:
@@ -83,9 +81,9 @@ class Checkout:
 
     # -- imports
 
-    def imported_from(self, module: Module, node: cst.ImportFrom, member: str = "") -> Optional[Module]:
+    def imported_from(self, module: Module, node: ast.ImportFrom, member: str = "") -> Optional[Module]:
         """Return the checkout's module that a ``from ... import`` statement names."""
-        return self.find_module(module, imported_name(node), len(node.relative), member)
+        return self.find_module(module, node.module or "", node.level, member)
 
     @remembered
     def find_module(self, module: Module, name: str, level: int, member: str = "") -> Optional[Module]:
@@ -117,8 +115,3 @@ class Checkout:
         shared = [len(set(above) & set(PurePosixPath(file).parents)) for file in ends]
         nearest = [file for file, count in zip(ends, shared) if count == max(shared)]
         return nearest[0] if len(nearest) == 1 else None
-
-
-def imported_name(node: cst.ImportFrom) -> str:
-    """Return the dotted name after ``from``, without its leading dots."""
-    return "" if node.module is None else (dotted(node.module) or "")

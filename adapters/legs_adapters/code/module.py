@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from dataclasses import dataclass
-from typing import Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, TypeVar
+from typing import Any, Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, TypeVar
 
-import libcst as cst
-
-from legs_adapters.code.flow import MUTATORS, Flow
+from legs_adapters.code.flow import Flow
 from legs_adapters.code.limits import Budget, over_the_limits, parsing_steps, remembered
-from legs_adapters.code.parsing import STUB, Lines, Part, Place, body_part, outline_part, read_by_python
+from legs_adapters.code.parsing import Lines, Place
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.sources import Source, Unreadable
-from legs_adapters.code.syntax import arguments, children, dotted
+from legs_adapters.code.syntax import FUNCTIONS, arguments, children, dotted, walk_expressions
 
 CALLED = ("forward", "__call__")  # what calling an instance runs: a torch module's own, and Python's
 
 _T = TypeVar("_T")
+
 _WORD = re.compile(r"\w+(?:\s*\()?")  # a word, and whether it is called
-# What a text may store; for what it only reads, its function is not parsed.
-# Neither called nor read through an attribute, and behind it an assignment, an ``in``, a colon or a line that goes on.
-_STORED = re.compile(
-    rf"self\.(\w+)(?:(?=\.(?:{'|'.join(sorted(MUTATORS))}|\w+_)[ \t]*\()|(?!\w|[ \t]*[.(])"
-    r"(?=(?:[^\n]{0,400}(?:[^=!<>]|<<|>>))?=(?!=)|[^\n]{0,400}\bin\b|[^\n)[]{0,400}:"
-    r"|[^\n)]{0,400}(?:[,([\\]\s*(?:#[^\n]*)?$|\n\s*[])])))",
-    re.M,
-)
-_DEFINES = re.compile(r"^[ \t]+(async[ \t]+)?(def|class)\b", re.M)
 
 
 @dataclass(eq=False, repr=False)  # the text of one would be that of all its nodes
@@ -36,90 +27,71 @@ class Function:
 
     Attributes:
         module, name: its file and its name.
-        node: its header; its body is ``body``.
+        node, body: its definition, and the statements in it.
         parent: the function around it, or the module's top level; None for the top level itself.
         owner: its class, for a method.
-        cut: the bytes of its body, where that is not part of ``node``.
-        text: the text that contains it: its own body, or (where that was not cut out) the text around it. It is
-            searched before anything is parsed.
+        inner: the functions that are defined in its body, in source order; of a top level none.
     """
 
     module: Module
-    node: cst.FunctionDef | cst.Module
+    node: ast.FunctionDef | ast.AsyncFunctionDef | ast.Module
     parent: Optional[Function] = None
     owner: Optional[Class] = None
-    cut: Optional[slice] = None
-    _part: Optional[Part] = None
 
     def __post_init__(self) -> None:
-        self._inner: List[Function] = []
-        self.name: str = self.node.name.value if isinstance(self.node, cst.FunctionDef) else ""
-        is_inside = self.parent is not None and self.parent.parent is not None
-        around = self.parent.text if is_inside and self.parent is not None else self.module.outline_text
-        self.text: str = around if self.cut is None else self.module.lines.data[self.cut].decode("utf-8")
+        self.inner: List[Function] = []
+        self.name: str = getattr(self.node, "name", "")
+        self.body: List[ast.stmt] = self.node.body
 
     @property
     @remembered
-    def body(self) -> cst.BaseSuite | cst.Module:
-        """Its statements, parsed on first use."""
-        if self.cut is not None and self.module.spend(parsing_steps(self.text)):
-            try:
-                self._part = body_part(self.module.lines, self.cut)
-                header = self._part.tree.body[0]
-                assert isinstance(header, cst.FunctionDef)
-                self._inner = self.module.collect(header.body, self)
-                return header.body
-            except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
-                before = self.module.lines.place(self.cut.start, self.cut.start).line - 2
-                self.module.failure = _failure(self.module.path, self.module.text, error, before)
-        return self.node if isinstance(self.node, cst.Module) else self.node.body
+    def text(self) -> str:
+        """Its body as written; of a top level the file without the bodies of its functions."""
+        data, cuts = self.module.lines.data, [each.span for each in self.module.functions if self.parent is None]
+        starts, ends = [0, *(cut.stop for cut in cuts)], [*(cut.start for cut in cuts), len(data)]
+        pieces = [self.span] if self.parent is not None else [slice(*each) for each in zip(starts, ends)]
+        return b"".join(data[piece] for piece in pieces).decode("utf-8")
 
     @property
-    @remembered
-    def inner(self) -> List[Function]:
-        """The functions that are defined in its body, and theirs, in source order."""
-        if self.cut is not None and _DEFINES.search(self.text):
-            assert self.body is not None  # which finds them
-        return self._inner
+    def span(self) -> slice:
+        """The bytes of its body."""
+        return slice(self.place(self.body[0]).start, self.place(self.body[-1]).end)
 
-    def place(self, node: cst.CSTNode, brackets: bool = False) -> Place:
-        """Return the place of a node of it in the file, on request with the brackets around it.
+    def walk(self) -> Iterator[ast.AST]:
+        """Yield the nodes of its body, but for the functions and classes in it."""
+        return walk_expressions(*(node for node in self.body if not isinstance(node, (*FUNCTIONS, ast.ClassDef))))
 
-        Raises:
-            ValueError: LibCST would write another text than it read.
-        """
-        scope: Function = self.parent if self.parent is not None and node is self.node else self
-        while scope._part is None and scope.parent is not None:
-            scope = scope.parent
-        return (scope._part or self.module.outline).place(node, brackets)
+    def place(self, node: ast.AST, brackets: bool = False) -> Place:
+        """Return the place of a node in the file, on request with the brackets around it."""
+        return self.module.lines.place(node, brackets)
 
     @property
     @remembered
     def flow(self) -> Flow:
         """Its reaching definitions, computed once."""
-        parameters = self.node.params if isinstance(self.node, cst.FunctionDef) else None
+        parameters = None if isinstance(self.node, ast.Module) else self.node.args
         try:
             flow = Flow(self.body, parameters, self.module.budget.left(self.module.path))
             if self.module.spend(flow.steps):
                 return flow
         except RecursionError as error:
-            self.module.failure = _failure(self.module.path, self.module.text, error)
-        return Flow(cst.Module(body=[]), parameters)
+            self.module.failure = _failure(self.module.path, error)
+        return Flow([], parameters)
 
     @property
     def parameters(self) -> List[str]:
         """Positional parameters' names, ``self`` and ``cls`` excepted."""
-        if not isinstance(self.node, cst.FunctionDef):
+        if isinstance(self.node, ast.Module):
             return []
-        names = [param.name.value for param in (*self.node.params.posonly_params, *self.node.params.params)]
+        names = [param.arg for param in (*getattr(self.node.args, "posonlyargs", ()), *self.node.args.args)]
         return names[1:] if self.owner is not None and "staticmethod" not in self.decorators and names else names
 
-    def is_parameter(self, node: cst.CSTNode) -> bool:
+    def is_parameter(self, node: ast.AST) -> bool:
         """Return whether a name is a parameter of the function and has no other definition."""
-        known = isinstance(node, cst.Name) and node.value in self.parameters
+        known = isinstance(node, ast.Name) and node.id in self.parameters
         return known and all(definition.kind == "parameter" for definition in self.flow.reaching(node))
 
-    def given(self, call: cst.Call, parameter: str) -> Optional[cst.BaseExpression]:
+    def given(self, call: ast.Call, parameter: str) -> Optional[ast.expr]:
         """Return the argument of a call of it for a parameter; None where it is missing or starred."""
         positional, keywords, _ = arguments(call)
         if parameter in keywords or parameter not in self.parameters:
@@ -130,8 +102,8 @@ class Function:
     @property
     def decorators(self) -> List[str]:
         """The last names of its decorators."""
-        found = [each.decorator for each in self.node.decorators] if isinstance(self.node, cst.FunctionDef) else []
-        names = [dotted(node.func if isinstance(node, cst.Call) else node) or "" for node in found]
+        found = [] if isinstance(self.node, ast.Module) else self.node.decorator_list
+        names = [dotted(node.func if isinstance(node, ast.Call) else node) or "" for node in found]
         return [name.split(".")[-1] for name in names]
 
 
@@ -140,19 +112,19 @@ class Class:
     """A class: its methods, and the values that they store in its attributes."""
 
     module: Module
-    node: cst.ClassDef
+    node: ast.ClassDef
     parent: Function
 
     def __post_init__(self) -> None:
-        self.name: str = self.node.name.value
+        self.name: str = self.node.name
         self.methods: Dict[str, Function] = {}
 
     @remembered
-    def stores(self, attribute: str, where: Callable[[Function], bool] = bool) -> List[Tuple[Function, Definition]]:
-        """Return what its methods (those of which ``where`` is true) assign to ``self.attribute``."""
-        mentions = [method for method in self.methods.values() if f"self.{attribute}" in method.text]
-        methods = [each for each in mentions if attribute in _STORED.findall(each.text) and where(each)]
-        found = [(method, d) for method in methods for d in method.flow.definitions.get(f"self.{attribute}", ())]
+    def stores(self, attribute: str) -> List[Tuple[Function, Definition]]:
+        """Return what its methods assign to ``self.attribute``."""
+        place = f"self.{attribute}"
+        methods = [each for each in self.methods.values() if place in each.text]
+        found = [(method, made) for method in methods for made in method.flow.definitions.get(place, ())]
         # Of `self.x.y = v` nothing is stored in x itself; of `self.x["key"] = v` something is.
         return [(method, made) for method, made in found if not str(made.key).startswith(".")]
 
@@ -162,8 +134,8 @@ class Module:
 
     Attributes:
         text, lines: the file's text.
-        outline, outline_text: the file without the bodies of its functions.
-        failure: why a body of it could not be parsed, or is not analysed further.
+        functions: its functions and methods that are in no other, in source order.
+        failure: why it is not analysed further.
         budget: what its analysis may take, with that of the other files.
     """
 
@@ -172,34 +144,28 @@ class Module:
         self.budget: Budget = budget or Budget()
         self.text = text
         self.lines: Lines = Lines(text.encode("utf-8"))
-        parts = outline_part(self.lines)
-        self.outline: Part = parts[0]
-        self.outline_text: str = STUB.sub("0", self.outline.text.decode("utf-8"))
         self.failure: Optional[Unreadable] = None
-        self.spend(parsing_steps(self.outline_text))
+        self.spend(parsing_steps(text))
         self.by_node: Dict[int, Function | Class] = {}
-        self.top: Function = Function(self, self.outline.tree)
+        self.top: Function = Function(self, self.lines.tree())
         self._by_word: Optional[Dict[str, List[Function]]] = None
-        self._cuts: Iterator[Optional[slice]] = iter(parts[1])
-        self._functions = self.collect(self.outline.tree, self.top)
+        self.functions: List[Function] = self._collect(self.top.body, self.top)
 
-    def collect(self, body: cst.CSTNode, parent: Function, owner: Optional[Class] = None) -> List[Function]:
+    def _collect(self, body: Sequence[ast.stmt], parent: Function, owner: Optional[Class] = None) -> List[Function]:
         """Record what a body defines; return its functions, in source order."""
         functions: List[Function] = []
         for node in _definitions(body):
-            if isinstance(node, cst.FunctionDef):
-                cut = next(self._cuts, None) if parent is self.top else None
-                function = Function(self, node, parent, owner, cut)
-                functions.append(function)
-                self.by_node[id(node)] = function
-                if owner is not None:
-                    owner.methods.setdefault(function.name, function)
-                if cut is None:
-                    function._inner = self.collect(node.body, function)
-            else:
+            if isinstance(node, ast.ClassDef):
                 found = Class(self, node, parent)
                 self.by_node[id(node)] = found
-                functions += self.collect(node.body, parent, found)
+                functions += self._collect(node.body, parent, found)
+                continue
+            function = Function(self, node, parent, owner)
+            functions.append(function)
+            self.by_node[id(node)] = function
+            if owner is not None:
+                owner.methods.setdefault(function.name, function)
+            function.inner = self._collect(node.body, function)
         return functions
 
     def spend(self, steps: int) -> bool:
@@ -211,40 +177,35 @@ class Module:
 
     def scopes(self, matches: Callable[[str], object]) -> Iterator[Function]:
         """Yield the top level and the functions whose text matches."""
-        return _chosen([self.top, *self._functions], matches)
+        return _chosen([self.top, *self.functions], matches)
 
     def mentioning(self, name: str, called: bool = False) -> Iterator[Function]:
         """Yield the scopes whose text has a word, or calls it, from an index of words."""
         if self._by_word is None:
-            self._by_word = index_by_word((scope, scope.text) for scope in (self.top, *self._functions))
+            self._by_word = index_by_word((scope, scope.text) for scope in (self.top, *self.functions))
         for scope in self._by_word.get(f"{name}(" if called else name, ()):
             yield scope
             if scope.inner:
                 pattern = re.compile(rf"\b{re.escape(name)}" + (r"\s*\(" if called else r"\b"))
-                yield from _chosen(scope.inner, pattern.search, scope.text)
+                yield from _chosen(scope.inner, pattern.search)
 
 
 def index_by_word(texts: Iterable[Tuple[_T, str]]) -> Dict[str, List[_T]]:
     """Return what has a word in its text, by the word; by ``word(`` what calls it."""
     found: Dict[str, List[_T]] = {}
-    before, known = "", {""}
     for entry, text in texts:
-        if text is not before:  # before Python 3.8 all functions of a file share its text
-            called = {"".join(each.split()) for each in set(_WORD.findall(text))}
-            before, known = text, called.union(each.rstrip("(") for each in called)
-        for word in known:
+        called = {"".join(each.split()) for each in set(_WORD.findall(text))}
+        for word in called.union(each.rstrip("(") for each in called):
             found.setdefault(word, []).append(entry)
     return found
 
 
-def _chosen(
-    functions: Sequence[Function], matches: Callable[[str], object], matched: Optional[str] = None
-) -> Iterator[Function]:
-    """Yield the functions whose text matches; a text that several share is matched once."""
+def _chosen(functions: Sequence[Function], matches: Callable[[str], object]) -> Iterator[Function]:
+    """Yield the functions whose text matches."""
     for function in functions:
-        if function.text is matched or matches(function.text):
+        if matches(function.text):
             yield function
-            yield from _chosen(function.inner, matches, function.text)
+            yield from _chosen(function.inner, matches)
 
 
 def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadable:
@@ -254,35 +215,31 @@ def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadabl
         return Unreadable(source.path, over)
     try:
         return Module(source.path, source.text, budget)
-    except (cst.ParserSyntaxError, RecursionError, ValueError) as error:
-        return _failure(source.path, source.text, error)
+    except (SyntaxError, RecursionError, ValueError, MemoryError) as error:
+        return _failure(source.path, error)
 
 
-def _failure(path: str, text: str, error: Exception, lines_before: int = 0) -> Unreadable:
-    if isinstance(error, cst.ParserSyntaxError):
-        known, line = read_by_python(text.encode("utf-8")), lines_before + error.raw_line
-        why = "Python reads it, and LibCST does not"
-        if isinstance(known, SyntaxError):
-            line, why = known.lineno or line, known.msg
-        return Unreadable(path, f"does not parse (line {line}: {why})")
-    if isinstance(error, RecursionError):
+def _failure(path: str, error: Exception) -> Unreadable:
+    if isinstance(error, SyntaxError):
+        return Unreadable(path, f"does not parse (line {error.lineno}: {error.msg})")
+    if isinstance(error, (RecursionError, MemoryError)):
         return Unreadable(path, "is nested too deeply")
     return Unreadable(path, f"cannot be parsed: {type(error).__name__}")
 
 
-def _definitions(node: cst.CSTNode) -> Iterator[cst.FunctionDef | cst.ClassDef]:
+def _definitions(body: Iterable[ast.AST]) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef]:
     """Yield the functions and classes that a body defines, in branches and loops too, in source order."""
-    for child in children(node):
-        if isinstance(child, (cst.FunctionDef, cst.ClassDef)):
-            yield child
-        elif not isinstance(child, (cst.BaseExpression, cst.SimpleStatementLine)):
-            yield from _definitions(child)
+    for node in body:
+        if isinstance(node, (*FUNCTIONS, ast.ClassDef)):
+            yield node
+        elif not isinstance(node, ast.expr):
+            yield from _definitions(children(node))
 
 
-def blocks_of(node: cst.CSTNode) -> Iterator[Sequence[cst.CSTNode]]:
-    """Yield the blocks of a statement: of a compound one those of all its branches."""
-    for child in children(node):
-        if isinstance(child, cst.BaseSuite):
-            yield child.body
-        elif not isinstance(child, cst.BaseExpression):
-            yield from blocks_of(child)
+def blocks_of(node: Any) -> Iterator[List[ast.stmt]]:
+    """Yield the blocks of a statement: of a compound one those of all its branches, with each ``elif``."""
+    parts = [node, *getattr(node, "handlers", ()), *getattr(node, "cases", ())]
+    for block in [getattr(part, name, None) for part in parts for name in ("body", "orelse", "finalbody")]:
+        if isinstance(block, list) and block:
+            is_elif = isinstance(block[0], ast.If) and block[0].col_offset == node.col_offset
+            yield from blocks_of(block[0]) if is_elif else [block]

@@ -5,16 +5,15 @@ Where only the run time knows the class of an object, its methods are unknown.
 
 from __future__ import annotations
 
+import ast
 from typing import Dict, Iterable, Iterator, List, NamedTuple, Optional, Tuple
 
-import libcst as cst
-
-from legs_adapters.code.checkout import Checkout, imported_name
+from legs_adapters.code.checkout import Checkout
 from legs_adapters.code.limits import Budget, remembered
 from legs_adapters.code.module import CALLED, Class, Function, Module
 from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.sources import Source
-from legs_adapters.code.syntax import arguments, call_name, dotted, path_of
+from legs_adapters.code.syntax import arguments, call_name, dotted, entries, path_of
 
 _MAX_DEPTH = 16  # how many names are followed, one to the next
 
@@ -54,30 +53,29 @@ class Program(Checkout):
         self._joined: Dict[Tuple[Reaching, int], List[Reference]] = {}  # by a join of definitions and the depth
 
     @remembered
-    def resolve(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[Reference]:
+    def resolve(self, function: Function, node: ast.AST, depth: int = 0) -> List[Reference]:
         """Return what an expression may refer to; empty where it is unknown."""
         if depth > _MAX_DEPTH or not function.module.spend(1):
             return []
         return list(dict.fromkeys(self._resolve(function, node, depth + 1)))
 
-    def _resolve(self, function: Function, node: cst.CSTNode, depth: int) -> Iterable[Reference]:
-        if isinstance(node, cst.Name):
+    def _resolve(self, function: Function, node: ast.AST, depth: int) -> Iterable[Reference]:
+        if isinstance(node, ast.Name):
             found = self.lookup(function, node)
-            return self._of(*found, depth) if found else self._member_of_module(function.module, node.value, depth)
-        if isinstance(node, cst.Attribute):
+            return self._of(*found, depth) if found else self._member_of_module(function.module, node.id, depth)
+        if isinstance(node, ast.Attribute):
             return self._attribute(function, node, depth)
-        if isinstance(node, cst.Call):
+        if isinstance(node, ast.Call):
             return self._call(function, node, depth)
-        if isinstance(node, cst.Subscript):
+        if isinstance(node, ast.Subscript):
             return self.resolve(function, node.value, depth)  # one of a dictionary's values, LOSSES[kind]
-        if isinstance(node, cst.Dict):
-            values = [each.value for each in node.elements if isinstance(each, cst.DictElement)]
-            return [ref for value in values for ref in self.resolve(function, value, depth)]
-        if isinstance(node, cst.IfExp):
+        if isinstance(node, ast.Dict):
+            return [ref for _, value in entries(node) for ref in self.resolve(function, value, depth)]
+        if isinstance(node, ast.IfExp):
             return self.resolve(function, node.body, depth) + self.resolve(function, node.orelse, depth)
-        return [Reference("lambda", node)] if isinstance(node, cst.Lambda) else []
+        return [Reference("lambda", node)] if isinstance(node, ast.Lambda) else []
 
-    def lookup(self, function: Function, node: cst.CSTNode) -> Optional[Tuple[Function, Reaching]]:
+    def lookup(self, function: Function, node: ast.AST) -> Optional[Tuple[Function, Reaching]]:
         """Return the definitions that a place may come from, and their function; None if unknown."""
         local = function.flow.reaching(node)
         if local:
@@ -110,19 +108,19 @@ class Program(Checkout):
             return declared + self.resolve(where, value, depth + 1)
         return declared
 
-    def _declared(self, where: Function, parameter: cst.CSTNode, depth: int) -> List[Reference]:
+    def _declared(self, where: Function, parameter: ast.AST, depth: int) -> List[Reference]:
         """Resolve ``metric: Metric``: an instance of the class, or of one that derives from it."""
-        note = parameter.annotation.annotation if isinstance(parameter, cst.Param) and parameter.annotation else None
-        if not isinstance(note, (cst.Name, cst.Attribute)):
+        note = getattr(parameter, "annotation", None)
+        if not isinstance(note, (ast.Name, ast.Attribute)):
             return []
         named = self.resolve(where.parent or where, note, depth + 1)
         return [Reference("declared", ref.target) for ref in named if ref.kind == "class"]
 
     # -- calls
 
-    def _call(self, function: Function, node: cst.Call, depth: int) -> List[Reference]:
+    def _call(self, function: Function, node: ast.Call, depth: int) -> List[Reference]:
         if call_name(node) == "partial" and node.args:
-            return self.resolve(function, node.args[0].value, depth)
+            return self.resolve(function, node.args[0], depth)
         same = self._same(function, node, depth)
         if same:
             return same
@@ -131,10 +129,10 @@ class Program(Checkout):
         instances += [Reference("made by", ref.target) for ref in made if ref.kind == "external"]
         return instances + self._returned(made, depth)
 
-    def _same(self, function: Function, node: cst.Call, depth: int) -> List[Reference]:
+    def _same(self, function: Function, node: ast.Call, depth: int) -> List[Reference]:
         """Resolve calls that return what they are given: ``model.cuda()``, ``DataParallel(model)``."""
         name, func = call_name(node), node.func
-        if name in self._returning_self and isinstance(func, cst.Attribute):
+        if name in self._returning_self and isinstance(func, ast.Attribute):
             return [ref for ref in self.resolve(function, func.value, depth) if ref.kind in ("instance", "made by")]
         given = arguments(node)[0][:1] if f".{dotted(func) or name}".endswith(self._wrapping) else []
         return [ref for each in given for ref in self.resolve(function, each, depth) if ref.kind == "instance"]
@@ -155,7 +153,7 @@ class Program(Checkout):
         if definitions:
             return self._of(module.top, definitions, depth)
         for node in module.top.flow.imports:
-            if isinstance(node, cst.ImportFrom) and isinstance(node.names, cst.ImportStar):
+            if isinstance(node, ast.ImportFrom) and node.names[0].name == "*":
                 other = self.imported_from(module, node)
                 found = self._member_of_module(other, name, depth + 1) if other not in (None, module) else []
                 if found:
@@ -164,29 +162,29 @@ class Program(Checkout):
 
     def _imported(self, module: Module, definition: Definition, depth: int) -> List[Reference]:
         alias, node = definition.node, definition.value
-        assert isinstance(alias, cst.ImportAlias)
-        name = dotted(alias.name) or ""
-        if not isinstance(node, cst.ImportFrom):
+        assert isinstance(alias, ast.alias)
+        name = alias.name
+        if not isinstance(node, ast.ImportFrom):
             full = name if alias.asname is not None else name.split(".")[0]
             found = self.find_module(module, full, 0)
             return [Reference("external", full) if found is None else Reference("module", found)]
         base = self.imported_from(module, node) or self.imported_from(module, node, name)
         members = self._member_of_module(base, name, depth) if base is not None else []
-        full = f"{imported_name(node)}.{name}" if imported_name(node) else name
-        inside = None if members else self.find_module(module, full, len(node.relative))
+        full = f"{node.module}.{name}" if node.module else name
+        inside = None if members else self.find_module(module, full, node.level)
         if inside is not None:
             return [Reference("module", inside)]
         return members if base is not None else [Reference("external", full)]
 
     # -- attributes
 
-    def _attribute(self, function: Function, node: cst.Attribute, depth: int) -> List[Reference]:
-        name = node.attr.value
+    def _attribute(self, function: Function, node: ast.Attribute, depth: int) -> List[Reference]:
+        name = node.attr
         if function.flow.reaching(node):
             references = self._of(function, function.flow.reaching(node), depth)
             if references:
                 return references
-        if isinstance(node.value, cst.Name) and node.value.value in ("self", "cls"):
+        if isinstance(node.value, ast.Name) and node.value.id in ("self", "cls"):
             owner = self.owner_of(function)
             if owner is not None:
                 return self.member(owner, name, depth) + self._overrides(owner, name)
@@ -217,7 +215,7 @@ class Program(Checkout):
         known = [owner]
         for current in known:  # which grows
             yield current
-            bases = [ref.target for arg in current.node.bases for ref in self.resolve(current.parent, arg.value)]
+            bases = [ref.target for base in current.node.bases for ref in self.resolve(current.parent, base)]
             known += [base for base in bases if isinstance(base, Class) and base not in known]
 
     def member(self, owner: Class, name: str, depth: int = 0) -> List[Reference]:

@@ -6,10 +6,9 @@
 
 from __future__ import annotations
 
+import ast
 from dataclasses import dataclass
 from typing import Callable, ClassVar, Dict, Iterator, List, Optional, Sequence, Set
-
-import libcst as cst
 
 
 class Reaching:
@@ -79,8 +78,8 @@ class Definition(Reaching):
 
     place: str
     kind: str
-    node: cst.CSTNode
-    value: Optional[cst.CSTNode] = None
+    node: ast.AST
+    value: Optional[ast.AST] = None
     index: Optional[int] = None
     key: object = None
     order: int = 0

@@ -2,58 +2,55 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Optional
-
-import libcst as cst
+import ast
+import copy
+from typing import Any, Dict, Optional
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.reaching import Definition
 from legs_adapters.code.syntax import constant, index_of
 
 
-def returned(function: Function) -> Optional[cst.CSTNode]:
+def returned(function: Function) -> Optional[ast.expr]:
     """Return what straight-line code returns, its local names filled in; None where that is not one expression."""
-    names: Dict[str, cst.BaseExpression] = {}
-    work: List[cst.CSTNode] = list(function.body.body)
-    while work:
-        statement = work.pop(0)
-        if isinstance(statement, cst.SimpleStatementLine):
-            work[:0] = statement.body
-        elif isinstance(statement, cst.Return):
-            return _filled(function, statement.value, names) if statement.value is not None else None
-        elif isinstance(statement, cst.Assign) and isinstance(statement.targets[0].target, cst.Name):
-            names[statement.targets[0].target.value] = _filled(function, statement.value, names)
-        elif not isinstance(statement, (cst.Assert, cst.Pass)) and not _is_text(statement):
+    names: Dict[str, ast.expr] = {}
+    for statement in function.body:
+        if isinstance(statement, ast.Return):
+            return _filled(statement.value, names) if statement.value is not None else None
+        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
+            names[statement.targets[0].id] = _filled(statement.value, names)
+        elif not isinstance(statement, (ast.Assert, ast.Pass)) and not _is_text(statement):
             return None
     return None
 
 
-def _is_text(statement: cst.CSTNode) -> bool:
-    return isinstance(statement, cst.Expr) and isinstance(statement.value, (cst.SimpleString, cst.ConcatenatedString))
+def _is_text(statement: ast.stmt) -> bool:
+    return isinstance(statement, ast.Expr) and isinstance(constant(statement.value), str)
 
 
-def _filled(function: Function, node: cst.BaseExpression, names: Dict[str, cst.BaseExpression]) -> cst.BaseExpression:
+def _filled(node: Any, names: Dict[str, ast.expr]) -> Any:
     """Return an expression with the values of local names in their place."""
-    reads = set(map(id, function.flow.reads_in(node)))
-
-    class Fill(cst.CSTTransformer):
-        def leave_Name(self, original_node: cst.Name, updated_node: cst.Name) -> cst.BaseExpression:
-            return names.get(original_node.value, updated_node) if id(original_node) in reads else updated_node
-
-    filled = node.visit(Fill()) if names else node
-    assert isinstance(filled, cst.BaseExpression)
+    if isinstance(node, ast.Name):
+        return names.get(node.id, node)
+    if isinstance(node, list):
+        return [_filled(part, names) for part in node]
+    if not isinstance(node, ast.AST) or not names:
+        return node
+    filled = copy.copy(node)
+    for name in node._fields:
+        setattr(filled, name, _filled(getattr(node, name, None), names))
     return filled
 
 
-def formatted_key(node: cst.Subscript) -> Optional[str]:
+def formatted_key(node: ast.Subscript) -> Optional[str]:
     """Return the literal part of the key of ``outputs[f"image_{i}"]``."""
     value = index_of(node)
-    parts = value.parts if isinstance(value, cst.FormattedString) else ()
-    return "_".join(part.value for part in parts if isinstance(part, cst.FormattedStringText)) or None
+    parts = map(constant, value.values) if isinstance(value, ast.JoinedStr) else ()
+    return "_".join(part for part in parts if isinstance(part, str)) or None
 
 
-def default_key(function: Function, node: cst.Subscript) -> object:
+def default_key(function: Function, node: ast.Subscript) -> object:
     """Return ``"rgb"`` for ``preds[key]`` of a function with the parameter ``key="rgb"``."""
     index = index_of(node)
-    found = function.flow.reaching(index) if isinstance(index, cst.Name) else None
+    found = function.flow.reaching(index) if isinstance(index, ast.Name) else None
     return constant(found.value) if isinstance(found, Definition) and found.kind == "parameter" else None

@@ -1,40 +1,52 @@
-"""Helpers for LibCST trees: a node's name, the words in it, the value of a constant."""
+"""Helpers for syntax trees: a node's name, the words in it, the value of a constant."""
 
 from __future__ import annotations
 
 import ast
-import dataclasses
 import functools
 import re
-from typing import Any, Dict, FrozenSet, Iterator, List, Optional, Set, Tuple
+from typing import Any, Dict, FrozenSet, Iterator, List, NamedTuple, Optional, Set, Tuple
 
-import libcst as cst
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+LOOPS = (ast.For, ast.AsyncFor, ast.While)
+
 
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
-_EMPTY = cst.Module(body=[])
-_WORDS = (cst.Name, cst.SimpleString, cst.Integer, cst.Float)
-_LITERALS = (*_WORDS, cst.UnaryOperation, cst.Tuple, cst.List)
+_LITERALS = (ast.Constant, ast.UnaryOp, ast.Tuple, ast.List)
 _MISSING = object()
-_PUNCTUATION = re.compile(
-    "whitespace|[lr]par|[lr]brac|l.*_lines|lines_|trailing_|header|footer|comma|equal|dot|.*colon"
-)
-_NO_NODES = (str, bool, type(None), cst.MaybeSentinel)  # isinstance on every node is slow
-_SCOPES = (cst.FunctionDef, cst.ClassDef)
+_NO_PARTS = re.compile("ctx|ops?|type_.*|id|attr|arg|(as)?name|module|level|kind|conversion|simple|is_async")
+_SCOPES = (*FUNCTIONS, ast.ClassDef)
 
 
-def code(node: cst.CSTNode) -> str:
-    """Return a node's source text, exactly."""
-    if isinstance(node, _WORDS) and not node.lpar:
-        return node.value
-    return _EMPTY.code_for_node(node)
+class Arg(NamedTuple):
+    """An argument of a call: its value, its keyword or "", and its stars."""
+
+    value: ast.expr
+    keyword: str
+    star: str
 
 
-def one_line(node: cst.CSTNode) -> str:
+def code(node: ast.AST) -> str:
+    """Return a node's text in its file, without brackets around it; of a name that was made here, that name."""
+    lines = getattr(node, "source", None)
+    return str(lines.code(node)) if lines is not None else name_of(node)
+
+
+def one_line(node: ast.AST) -> str:
     """Return a node's source text on one line."""
     return " ".join(code(node).split())
 
 
-def dotted(node: cst.CSTNode) -> Optional[str]:
+def name_of(node: ast.AST) -> str:
+    """Return the identifier that a node has itself, of a variable, attribute, keyword or definition; or ""."""
+    for field in ("id", "attr", "arg", "name"):
+        name = getattr(node, field, None)
+        if isinstance(name, str):
+            return name
+    return ""
+
+
+def dotted(node: ast.AST) -> Optional[str]:
     """Return ``a.b.c`` for a chain of names, else None."""
     path = path_of(node)
     return None if path is None or "[" in path else path
@@ -45,92 +57,118 @@ def word_set(text: str) -> FrozenSet[str]:
     return frozenset(text.split())
 
 
+@functools.lru_cache(maxsize=4096)
 def words(name: str) -> Tuple[str, ...]:
     """Return the words of an identifier, lower case: ``gtImage_2`` is gt, image, 2."""
     return tuple(word.lower() for word in _CAMEL.findall(name))
 
 
-def constant(node: Optional[cst.CSTNode], default: Any = None) -> Any:
+def constant(node: Optional[ast.AST], default: Any = None) -> Any:
     """Return the value of a literal (also a negative number, a tuple of literals), else ``default``."""
-    value = _literal(code(node)) if isinstance(node, _LITERALS) else _MISSING
+    if type(node) is ast.Constant:
+        return default if node.value is ... else node.value
+    value = _literal(node) if isinstance(node, _LITERALS) else _MISSING
     return default if value is _MISSING else value
 
 
-@functools.lru_cache(maxsize=4096)
-def _literal(text: str) -> Any:
+def _literal(node: Any) -> Any:
     try:
-        value = ast.literal_eval(text)
-    except (SyntaxError, ValueError, TypeError):  # a name, "\x", or of a newer Python
+        value = ast.literal_eval(node)
+    except (SyntaxError, ValueError, TypeError):  # a name in it
         return _MISSING
     return tuple(value) if isinstance(value, list) else value
 
 
-def index_of(node: cst.CSTNode) -> Optional[cst.BaseExpression]:
+def indices(node: ast.Subscript) -> List[ast.expr]:
+    """Return the indices of ``x[a, b:c]``."""
+    several = isinstance(node.slice, ast.Tuple) and node.slice.elts
+    return list(several) if several else [node.slice]
+
+
+def index_of(node: Optional[ast.AST]) -> Optional[ast.expr]:
     """Return the only index of ``x[index]``; None for any other node, and for a slice."""
-    index = node.slice[0].slice if isinstance(node, cst.Subscript) and len(node.slice) == 1 else None
-    return index.value if isinstance(index, cst.Index) and index.star is None else None
+    index = indices(node) if isinstance(node, ast.Subscript) else []
+    return index[0] if len(index) == 1 and not isinstance(index[0], (ast.Slice, ast.Starred)) else None
 
 
-def key_of(node: cst.CSTNode) -> Any:
+def key_of(node: ast.AST) -> Any:
     """Return the literal key of ``x["key"]`` or ``x[0]``, else None."""
     value = constant(index_of(node))
     return value if isinstance(value, (str, int)) and not isinstance(value, bool) else None
 
 
-def path_of(node: cst.CSTNode) -> Optional[str]:
+def path_of(node: Optional[ast.AST]) -> Optional[str]:
     """Return one spelling for a place that can be assigned: ``x``, ``self.x``, ``losses['im']``; else None."""
-    if isinstance(node, cst.Name):
-        return node.value
-    base = path_of(node.value) if isinstance(node, (cst.Attribute, cst.Subscript)) else None
-    if base is not None and isinstance(node, cst.Attribute):
-        return f"{base}.{node.attr.value}"
-    key = key_of(node) if base is not None else None
+    if isinstance(node, ast.Name):
+        return node.id
+    base = path_of(node.value) if isinstance(node, (ast.Attribute, ast.Subscript)) else None
+    if base is not None and isinstance(node, ast.Attribute):
+        return f"{base}.{node.attr}"
+    key = key_of(node) if base is not None and node is not None else None
     return None if key is None else f"{base}[{key!r}]"
 
 
-def attribute_chain(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
+def attribute_chain(node: ast.AST) -> Iterator[ast.AST]:
     """Yield the node, then what it is an attribute, an item or a call of, down to the root."""
     while True:
         yield node
-        if isinstance(node, (cst.Attribute, cst.Subscript)):
+        if isinstance(node, (ast.Attribute, ast.Subscript)):
             node = node.value
-        elif isinstance(node, cst.Call):
+        elif isinstance(node, ast.Call):
             node = node.func
         else:
             return
 
 
-def root_of(node: cst.Name | cst.Attribute) -> str:
+def root_of(node: ast.Name | ast.Attribute) -> str:
     """Return the last name of ``a.b``: b."""
-    return node.value if isinstance(node, cst.Name) else node.attr.value
+    return node.id if isinstance(node, ast.Name) else node.attr
 
 
-def call_name(node: cst.Call) -> str:
+def call_name(node: ast.Call) -> str:
     """Return the last name of the callee: ``f`` of ``a.b.f(x)``; empty without one."""
-    return root_of(node.func) if isinstance(node.func, (cst.Name, cst.Attribute)) else ""
+    return root_of(node.func) if isinstance(node.func, (ast.Name, ast.Attribute)) else ""
 
 
-def arguments(node: cst.Call) -> Tuple[List[cst.BaseExpression], Dict[str, cst.BaseExpression], bool]:
+def given(node: ast.Call) -> List[Arg]:
+    """Return all arguments of a call, the positional ones first."""
+    starred = (ast.Starred,)
+    values = [Arg(a.value, "", "*") if isinstance(a, starred) else Arg(a, "", "") for a in node.args]
+    return values + [Arg(each.value, each.arg or "", "" if each.arg else "**") for each in node.keywords]
+
+
+def arguments(node: ast.Call) -> Tuple[List[ast.expr], Dict[str, ast.expr], bool]:
     """Return positional arguments, keyword arguments, and whether there is a ``*`` or ``**`` among them."""
-    plain = [arg for arg in node.args if not arg.star]
-    positional = [arg.value for arg in plain if arg.keyword is None]
-    keywords = {arg.keyword.value: arg.value for arg in plain if arg.keyword is not None}
-    return positional, keywords, len(plain) < len(node.args)
+    positional = [arg for arg in node.args if not isinstance(arg, ast.Starred)]
+    keywords = {each.arg: each.value for each in node.keywords if each.arg is not None}
+    return positional, keywords, len(positional) + len(keywords) < len(node.args) + len(node.keywords)
 
 
-def children(node: cst.CSTNode) -> List[cst.CSTNode]:
-    """Return a node's direct children in source order, without white space and punctuation."""
-    found: List[Any] = []
-    for name in _fields(type(node)):
-        value = getattr(node, name)
-        if type(value) not in _NO_NODES:
-            found += value if type(value) in (list, tuple) else (value,)
+def entries(node: ast.AST) -> List[Tuple[ast.expr, ast.expr]]:
+    """Return the keys and values of a literal dictionary, without those of ``**other``; nothing of any other node."""
+    pairs = zip(node.keys, node.values) if isinstance(node, ast.Dict) else ()
+    return [(key, value) for key, value in pairs if key is not None]
+
+
+def children(node: ast.AST) -> List[ast.AST]:
+    """Return a node's direct children, without operators and without the texts of an f-string."""
+    if isinstance(node, ast.Dict):
+        return [each for pair in zip(node.keys, node.values) for each in pair if each is not None]
+    if isinstance(node, ast.JoinedStr):
+        return [each for each in node.values if isinstance(each, ast.FormattedValue)]
+    found: List[ast.AST] = []
+    for name in _fields(type(node)):  # type: ignore[arg-type]
+        value = getattr(node, name, None)
+        if isinstance(value, ast.AST):
+            found.append(value)
+        elif type(value) is list:
+            found += [each for each in value if isinstance(each, ast.AST)]
     return found
 
 
-def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
-    """Yield a node and every node under it, but not the bodies of functions and classes under it."""
-    stack = [node]
+def walk_expressions(*nodes: ast.AST) -> Iterator[ast.AST]:
+    """Yield nodes and every node under them, but not the bodies of functions and classes under them."""
+    stack = list(reversed(nodes))
     while stack:
         node = stack.pop()
         yield node
@@ -139,43 +177,40 @@ def walk_expressions(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
 
 @functools.lru_cache(maxsize=None)
 def _fields(kind: Any) -> Tuple[str, ...]:
-    """Return the fields of a class of nodes, without those of white space, punctuation and text."""
-    fields = [field.name for field in dataclasses.fields(kind) if field.type is not str]
-    return tuple(name for name in fields if not _PUNCTUATION.match(name))
+    return tuple(name for name in kind._fields if not _NO_PARTS.fullmatch(name))
 
 
-def same(a: cst.CSTNode, b: cst.CSTNode) -> bool:
-    """Return whether two expressions have the same text, brackets and spaces aside."""
-    return a is b or _squeezed(a) == _squeezed(b)
+def same(a: ast.AST, b: ast.AST) -> bool:
+    """Return whether two expressions are equal, brackets, spaces and comments aside."""
+    return a is b or (type(a) is type(b) and _dumped(a) == _dumped(b))
 
 
-def _squeezed(node: cst.CSTNode) -> str:
-    """Return the text of an expression without brackets around it, spaces and comments."""
-    bare = node.with_changes(lpar=(), rpar=()) if isinstance(node, cst.BaseExpression) else node
-    return re.sub(r"\s+|#[^\n]*", "", code(bare))
+def _dumped(node: ast.AST) -> str:
+    return re.sub(r"ctx=\w+\(\)", "", ast.dump(node))
 
 
-def names_where(test: cst.CSTNode, holds: bool) -> Tuple[cst.Name | cst.Attribute, ...]:
+def names_where(test: ast.AST, holds: bool) -> Tuple[ast.Name | ast.Attribute, ...]:
     """Return the names that are true where a test holds, or does not: ``tracking and x > 0``, ``not tracking``."""
-    if isinstance(test, cst.UnaryOperation) and isinstance(test.operator, cst.Not):
-        return names_where(test.expression, not holds)
-    if holds and isinstance(test, cst.BooleanOperation) and isinstance(test.operator, cst.And):
-        return names_where(test.left, True) + names_where(test.right, True)
-    return (test,) if holds and isinstance(test, (cst.Name, cst.Attribute)) else ()
+    if isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not):
+        return names_where(test.operand, not holds)
+    if holds and isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And):
+        return tuple(name for value in test.values for name in names_where(value, True))
+    return (test,) if holds and isinstance(test, (ast.Name, ast.Attribute)) else ()
 
 
-def every_parameter(parameters: cst.Parameters) -> Iterator[cst.Param]:
-    """Yield the parameters of a function, ``*args`` and ``**kwargs`` included."""
-    named = (*parameters.posonly_params, *parameters.params, *parameters.kwonly_params)
-    return (each for each in (*named, parameters.star_arg, parameters.star_kwarg) if isinstance(each, cst.Param))
+def every_parameter(parameters: ast.arguments) -> Iterator[Tuple[ast.arg, Optional[ast.expr]]]:
+    """Yield the parameters of a function, ``*args`` and ``**kwargs`` included, each with its default."""
+    named = [*getattr(parameters, "posonlyargs", ()), *parameters.args]
+    defaults = [None] * (len(named) - len(parameters.defaults)) + list(parameters.defaults)
+    yield from zip(named, defaults)
+    yield from zip(parameters.kwonlyargs, parameters.kw_defaults)
+    yield from ((each, None) for each in (parameters.vararg, parameters.kwarg) if each is not None)
 
 
-def words_in(*nodes: cst.CSTNode) -> Set[str]:
+def words_in(*nodes: ast.AST) -> Set[str]:
     """Return the words of the names and strings in expressions."""
     found: Set[str] = set()
-    for node in (part for each in nodes for part in walk_expressions(each)):
-        if isinstance(node, cst.Name):
-            found.update(words(node.value))
-        elif isinstance(node, cst.SimpleString) and isinstance(constant(node), str):
-            found.update(words(constant(node)))
+    for node in walk_expressions(*nodes):
+        text = constant(node) if isinstance(node, ast.Constant) else name_of(node)
+        found.update(words(text) if isinstance(text, str) else ())
     return found

@@ -6,9 +6,8 @@ torch's operations do, then what a name says, then what the arguments are, then 
 
 from __future__ import annotations
 
+import ast
 from typing import Callable, Dict, List, Optional
-
-import libcst as cst
 
 from legs_adapters.code.calls import callees
 from legs_adapters.code.module import Function
@@ -18,9 +17,11 @@ from legs_adapters.code.syntax import (
     arguments,
     attribute_chain,
     call_name,
-    code,
     constant,
     dotted,
+    given,
+    indices,
+    name_of,
     same,
     walk_expressions,
     words,
@@ -42,7 +43,7 @@ from legs_adapters.tensors.operations import (
     REDUCES,
 )
 
-MeaningOf = Callable[[Function, cst.CSTNode], Meaning]  # of an expression of a function
+MeaningOf = Callable[[Function, ast.AST], Meaning]  # of an expression of a function
 
 
 class CallReading:
@@ -58,28 +59,28 @@ class CallReading:
         owner: the object whose method is called; None for a function, of a module too.
     """
 
-    def __init__(self, program: Program, function: Function, node: cst.Call, meaning_of: MeaningOf) -> None:
+    def __init__(self, program: Program, function: Function, node: ast.Call, meaning_of: MeaningOf) -> None:
         self.program = program
         self.function = function
         self.node = node
         self.meaning_of = meaning_of
         self.name: str = call_name(node)
-        self.positional: List[cst.BaseExpression] = arguments(node)[0]
-        self.keywords: Dict[str, cst.BaseExpression] = arguments(node)[1]
-        self.values: List[cst.BaseExpression] = [*self.positional, *self.keywords.values()]
-        base = node.func.value if isinstance(node.func, cst.Attribute) else None
-        self.owner: Optional[cst.BaseExpression] = None if self._is_module(base) else base
+        self.positional: List[ast.expr] = arguments(node)[0]
+        self.keywords: Dict[str, ast.expr] = arguments(node)[1]
+        self.values: List[ast.expr] = [*self.positional, *self.keywords.values()]
+        base = node.func.value if isinstance(node.func, ast.Attribute) else None
+        self.owner: Optional[ast.expr] = None if self._is_module(base) else base
 
-    def ask(self, node: cst.CSTNode) -> Meaning:
+    def ask(self, node: ast.AST) -> Meaning:
         """Return the meaning of an expression of the function."""
         return self.meaning_of(self.function, node)
 
-    def _is_module(self, node: Optional[cst.CSTNode]) -> bool:
+    def _is_module(self, node: Optional[ast.AST]) -> bool:
         """Return whether a name is a module's, ``th`` of ``import torch as th``."""
-        if not isinstance(node, cst.Name):
+        if not isinstance(node, ast.Name):
             return False
         found = self.program.lookup(self.function, node)
-        return node.value in MODULES or (found is not None and all(isinstance(d.value, cst.Import) for d in found[1]))
+        return node.id in MODULES or (found is not None and all(isinstance(d.value, ast.Import) for d in found[1]))
 
 
 def meaning_of_call(call: CallReading, by_arguments: bool = True) -> Meaning:
@@ -90,7 +91,7 @@ def meaning_of_call(call: CallReading, by_arguments: bool = True) -> Meaning:
 
 def _number(call: CallReading) -> Optional[Meaning]:
     """A number, or what has only the shape of its argument."""
-    is_number = call.name in NUMBERS if isinstance(call.node.func, cst.Name) else call.name == "item"
+    is_number = call.name in NUMBERS if isinstance(call.node.func, ast.Name) else call.name == "item"
     return UNKNOWN if is_number or call.name in ASKS else None
 
 
@@ -102,7 +103,7 @@ def _reduced(call: CallReading) -> Optional[Meaning]:
     if call.name in REDUCES | EXTREMES and all(isinstance(constant(axis), tuple) for axis in axes):
         return Meaning("parameter", None)
     made = of and (call.function.flow.value_of(of) or of)
-    is_joined = isinstance(made, cst.Call) and call_name(made) in JOINS  # the mean of several pictures
+    is_joined = isinstance(made, ast.Call) and call_name(made) in JOINS  # the mean of several pictures
     is_grey = call.name in REDUCES and constant(call.keywords.get("keepdim")) and not is_joined
     if of is None or not (is_grey or call.name in EXTREMES):
         return None
@@ -140,23 +141,23 @@ def _on_another_scale(call: CallReading) -> Optional[Meaning]:
     return meaning._replace(kind="logarithm") if meaning.kind == "image" else meaning
 
 
-def picked_from(call: cst.Call, index: int = 0) -> int:
+def picked_from(call: ast.Call, index: int = 0) -> int:
     """Return the channel at which a part of a picture begins, ``x.narrow(0, 3, 1)``, ``x.split([3, 1])[1]``; or 0."""
-    given = [constant(arg.value) for arg in call.args]
+    values = [constant(arg.value) for arg in given(call)]
     if call_name(call) == "narrow":
-        return given[-2] if isinstance(given[-2], int) else 0
-    sizes = next((each for each in given if isinstance(each, (list, tuple))), ())
+        return values[-2] if isinstance(values[-2], int) else 0
+    sizes = next((each for each in values if isinstance(each, (list, tuple))), ())
     return sum(each for each in sizes[:index] if isinstance(each, int)) if call_name(call) == "split" else 0
 
 
 def _keyed(call: CallReading) -> Optional[Meaning]:
     """The picture under the key that a call gives, ``drawn(camera, "depth")``, whatever other calls ask for."""
     for callee in callees(call.program, call.function, call.node) if call.values else ():
-        given = [(name, callee.given(call.node, name)) for name in callee.parameters]
-        said = {name: constant(call.function.flow.value_of(side) or side) for name, side in given if side is not None}
+        sides = [(name, callee.given(call.node, name)) for name in callee.parameters]
+        said = {name: constant(call.function.flow.value_of(side) or side) for name, side in sides if side is not None}
         keys = {name: key for name, key in said.items() if isinstance(key, str)}
-        parts = walk_expressions(callee.body) if keys and callee.module.spend(callee.flow.steps) else ()
-        names = [code(part.value) for part in parts if isinstance(part, cst.Index)]
+        parts = callee.walk() if keys and callee.module.spend(callee.flow.steps) else ()
+        names = [name_of(index) for part in parts if isinstance(part, ast.Subscript) for index in indices(part)]
         key = next((keys[name] for name in names if name in keys), "")
         if key:
             returned = mix(call.meaning_of(callee, value) for value in callee.flow.returns)
@@ -189,15 +190,15 @@ def _of_images(call: CallReading) -> Optional[Meaning]:
     """
     references = call.program.resolve(call.function, call.node.func)
     is_member = call.owner is not None and dotted(call.owner) == "self"
-    given = [call.ask(value) for value in call.values if constant(value) is None]
-    if any(LEARNED.match(str(each.target)) for each in references) and mix(given).role in ("target", "both"):
-        return Meaning("feature", mix(given).role)  # a network makes no photograph of one
+    asked = [call.ask(value) for value in call.values if constant(value) is None]
+    if any(LEARNED.match(str(each.target)) for each in references) and mix(asked).role in ("target", "both"):
+        return Meaning("feature", mix(asked).role)  # a network makes no photograph of one
     if any(map(_is_unlisted, references)) or (is_member and not references):
         return None
-    images = [meaning for meaning in given if meaning.kind == "image"]
+    images = [meaning for meaning in asked if meaning.kind == "image"]
     if not images:
-        kinds = ("depth", "channel", "normal", "flow", *(["feature"] if given and given[0].role == "target" else []))
-        return given[0] if len(given) == 1 and given[0].kind in kinds else None
+        kinds = ("depth", "channel", "normal", "flow", *(["feature"] if asked and asked[0].role == "target" else []))
+        return asked[0] if len(asked) == 1 and asked[0].kind in kinds else None
     bodies = [returned(target) for target in (each.target for each in references) if isinstance(target, Function)]
     changes = any(is_of_neighbours(part) for body in bodies if body is not None for part in attribute_chain(body))
     made, of = meaning_returned(call) or UNKNOWN, mix(images)
@@ -205,16 +206,14 @@ def _of_images(call: CallReading) -> Optional[Meaning]:
     return of._replace(kind="gradient" if changes else made.kind if is_other else of.kind)
 
 
-def is_of_neighbours(
-    node: cst.CSTNode, value_of: Callable[[cst.CSTNode], Optional[cst.CSTNode]] = lambda _: None
-) -> bool:
+def is_of_neighbours(node: ast.AST, value_of: Callable[[ast.AST], Optional[ast.AST]] = lambda _: None) -> bool:
     """Return whether it is a change in one picture: between shifted parts, ``x[1:] - x[:-1]``, or ``x - blur(x)``."""
-    if not isinstance(node, cst.BinaryOperation) or not isinstance(node.operator, cst.Subtract):
+    if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.Sub):
         return False
     left, right = node.left, value_of(node.right) or node.right
-    are_parts = isinstance(left, cst.Subscript) and isinstance(right, cst.Subscript) and same(left.value, right.value)
-    inner = walk_expressions(right.args[0].value) if isinstance(right, cst.Call) and right.args else ()
-    return are_parts or any(same(part, left) for part in inner)
+    are_parts = isinstance(left, ast.Subscript) and isinstance(right, ast.Subscript) and same(left.value, right.value)
+    first = [arg.value for arg in given(right)[:1]] if isinstance(right, ast.Call) else []
+    return are_parts or any(same(part, left) for part in walk_expressions(*first))
 
 
 def _is_unlisted(reference: Reference) -> bool:

@@ -7,9 +7,8 @@ and the field's words in the names along it. A name with "depth" or "feature" ou
 
 from __future__ import annotations
 
-from typing import FrozenSet, List, Optional, Tuple
-
-import libcst as cst
+import ast
+from typing import FrozenSet, List, Optional, Sequence, Tuple
 
 from legs_adapters.code.calls import callees, sure_calls, values_of
 from legs_adapters.code.module import Function
@@ -20,9 +19,11 @@ from legs_adapters.code.returned import default_key, formatted_key
 from legs_adapters.code.syntax import (
     arguments,
     call_name,
-    code,
     constant,
     dotted,
+    entries,
+    given,
+    indices,
     key_of,
     root_of,
     same,
@@ -36,8 +37,8 @@ from legs_adapters.lexicon.words import BACKGROUND, DATA, KIND_OF, LOSS, RENDER
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.operations import CONCATENATES
 
-_LITERALS = (cst.Dict, cst.List, cst.Tuple)
-_Argument = Tuple[Function, cst.Call, Optional[cst.BaseExpression]]  # with the call, and the function around it
+_LITERALS = (ast.Dict, ast.List, ast.Tuple)
+_Argument = Tuple[Function, ast.Call, Optional[ast.expr]]  # with the call, and the function around it
 
 
 class Meanings:
@@ -52,17 +53,17 @@ class Meanings:
         self.training = training
         self.questions: Questions = Questions()
 
-    def meaning(self, function: Function, node: cst.CSTNode) -> Meaning:
+    def meaning(self, function: Function, node: ast.AST) -> Meaning:
         """Return the meaning of an expression."""
         return self.questions.answer(function, node, self._of, UNKNOWN)
 
-    def origin(self, function: Function, node: cst.CSTNode) -> Meaning:
+    def origin(self, function: Function, node: ast.AST) -> Meaning:
         """Return the meaning from a name's definitions, without the name itself."""
-        while isinstance(node, cst.Subscript) and not isinstance(key_of(node), str):
+        while isinstance(node, ast.Subscript) and not isinstance(key_of(node), str):
             node = node.value
-        return self._flow(function, node) if isinstance(node, cst.Name) else self.meaning(function, node)
+        return self._flow(function, node) if isinstance(node, ast.Name) else self.meaning(function, node)
 
-    def _flow(self, function: Function, node: cst.CSTNode) -> Meaning:
+    def _flow(self, function: Function, node: ast.AST) -> Meaning:
         """Join the meanings of the definitions that reach this use."""
         found = self.program.lookup(function, node)
         return self._joined(self._reached(*found) if found is not None else frozenset())
@@ -79,72 +80,73 @@ class Meanings:
 
     # -- expressions
 
-    def _of(self, function: Function, node: cst.CSTNode) -> Meaning:
-        if isinstance(node, cst.Name):
+    def _of(self, function: Function, node: ast.AST) -> Meaning:
+        if isinstance(node, ast.Name):
             return self._name(function, node, self._flow(function, node))
-        if isinstance(node, cst.Attribute):
-            return self._member(function, node, node.attr.value)
-        if isinstance(node, cst.Subscript):
+        if isinstance(node, ast.Attribute):
+            return self._member(function, node, node.attr)
+        if isinstance(node, ast.Subscript):
             return self._subscript(function, node)
-        if isinstance(node, cst.Call):
+        if isinstance(node, ast.Call):
             table = _table_of(function, node)
             if table is not None:
-                return mix(self.meaning(function, each.value) for each in table.elements)
+                return mix(self.meaning(function, each) for each in table.values)
             return meaning_of_call(CallReading(self.program, function, node, self.meaning))
-        if isinstance(node, cst.Comparison):
+        if isinstance(node, ast.Compare):
             return Meaning("mask", None)
         if is_of_neighbours(node, function.flow.value_of):
             return Meaning("gradient", self.meaning(function, node.left).role)  # type: ignore[attr-defined]
         parts = [self.meaning(function, part) for part in parts_of(node)]
-        is_change = isinstance(getattr(node, "operator", None), cst.Subtract) and len(parts) == 2
+        is_change = isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub) and len(parts) == 2
         pictures = parts[0].kind in ("image", "logarithm") if is_change else False
         if pictures and parts[0] == parts[1] and parts[0].role:  # of two views or moments
             return Meaning("gradient", parts[0].role)
-        return mix(parts, isinstance(node, cst.BinaryOperation))
+        return mix(parts, isinstance(node, ast.BinOp))
 
-    def _name(self, function: Function, node: cst.Name, flow: Meaning) -> Meaning:
+    def _name(self, function: Function, node: ast.Name, flow: Meaning) -> Meaning:
         """Return the meaning of a name, of its words and of what is assigned to it."""
         shown = "image_" if flow.kind == "image" else ""
-        kind, role = kind_of_words(shown + node.value), role_of_words(node.value)
+        kind, role = kind_of_words(shown + node.id), role_of_words(node.id)
         role = role or flow.role
         if kind == "mask" and flow.kind in ("flow", "depth", "channel"):
             return Meaning("mask", role)  # motion_masks, alpha = depth_sil[1]: to be laid over a rendering
         return Meaning(more_special(kind, flow.kind), role)
 
-    def _subscript(self, function: Function, node: cst.Subscript) -> Meaning:
+    def _subscript(self, function: Function, node: ast.Subscript) -> Meaning:
         key = key_of(node) or formatted_key(node) or default_key(function, node)
         if is_fourth(node) or self._is_behind(function, node):
             return Meaning("channel", self.meaning(function, node.value).role)  # of RGB+D: render[..., 3], render[3:]
-        keys = [key] if isinstance(key, str) else self._keys(function, node.slice[-1].slice)
+        keys = [key] if isinstance(key, str) else self._keys(function, indices(node)[-1])
         if keys:
             return mix(self._member(function, node, each) for each in keys)
         return self._first(function, node.value, _cut(node) in ((None, 3), (0, 3)))
 
-    def _first(self, function: Function, node: cst.CSTNode, is_cut: bool) -> Meaning:
+    def _first(self, function: Function, node: ast.AST, is_cut: bool) -> Meaning:
         """Return the meaning of a value; of what is cut off it that of its first part: ``cat([image, depth])[:3]``."""
         whole = function.flow.value_of(node) or node
         made = [(function, whole), *values_of(self.program, function, whole)] if is_cut else []
-        joins = [(by, call) for by, call in made if isinstance(call, cst.Call) and call_name(call) in CONCATENATES]
-        firsts = [(by, part) for by, call in joins for part in parts_of(call.args[0].value)[:1]]
+        joins = [(by, call) for by, call in made if isinstance(call, ast.Call) and call_name(call) in CONCATENATES]
+        firsts = [(by, part) for by, call in joins for part in parts_of(given(call)[0].value)[:1]]
         return mix(self.meaning(*first) for first in firsts) if firsts else self.meaning(function, node)
 
-    def _is_behind(self, function: Function, node: cst.Subscript) -> bool:
+    def _is_behind(self, function: Function, node: ast.Subscript) -> bool:
         """Return whether one channel behind the colours is taken: ``x[3]``, ``x[-1:]``, ``x.split([3, 1])[1]``."""
-        if len(node.slice) > 1 and isinstance(node.slice[-1].slice, cst.Slice) and _cut(node) == (-1, None):
+        taken = indices(node)
+        if len(taken) > 1 and isinstance(taken[-1], ast.Slice) and _cut(node) == (-1, None):
             return self.meaning(function, node.value) != UNKNOWN  # no last sample of a ray: ends[..., -1:, 0]
-        index = node.slice[0].slice if len(node.slice) == 1 else None
-        is_last = isinstance(index, cst.Slice) and index.upper is None and constant(index.lower) == -1
-        at = constant(index.value) if isinstance(index, cst.Index) else -1 if is_last else None
-        if isinstance(node.value, cst.Call) and isinstance(at, int):
+        index = taken[0] if len(taken) == 1 else None
+        is_last = isinstance(index, ast.Slice) and index.upper is None and constant(index.lower) == -1
+        at = -1 if is_last else constant(index)
+        if isinstance(node.value, ast.Call) and isinstance(at, int):
             return picked_from(node.value, at) >= 3
         held = function.flow.value_of(node.value) or node.value  # a list or a batch has whole images: images[-1]
-        return at in (3, -1) and isinstance(held, cst.Subscript) and isinstance(key_of(held), str)
+        return at in (3, -1) and isinstance(held, ast.Subscript) and isinstance(key_of(held), str)
 
-    def _keys(self, function: Function, index: cst.CSTNode) -> List[str]:
+    def _keys(self, function: Function, index: ast.expr) -> List[str]:
         """Return the kinds of pictures that an index takes: in a loop over a literal, or by its function's calls."""
-        values: List[Optional[cst.CSTNode]] = []
+        values: List[Optional[ast.AST]] = []
         keys: List[object] = []
-        for made in function.flow.reaching(index.value) if isinstance(index, cst.Index) else ():
+        for made in function.flow.reaching(index):
             if made.kind == "parameter":
                 values += [function.given(call, made.place) for _, call in self.training.sites.get(function, ())]
             looped = list(walk_expressions(made.value)) if made.kind == "element" and made.value is not None else []
@@ -155,7 +157,7 @@ class Meanings:
         keys += map(constant, values)
         return [key for key in keys if isinstance(key, str) and kind_of_words(key) is not None]
 
-    def _member(self, function: Function, node: cst.Attribute | cst.Subscript, name: str) -> Meaning:
+    def _member(self, function: Function, node: ast.Attribute | ast.Subscript, name: str) -> Meaning:
         """Return the meaning of an attribute or an entry: of its words, what is assigned to it, and who holds it."""
         local = self._kept(function, node)
         role = role_of_words(name) or local.role
@@ -163,30 +165,29 @@ class Meanings:
             role = self._role_of_holder(function, node.value)
         return Meaning(more_special(kind_of_words(name), local.kind), role)
 
-    def _kept(self, function: Function, node: cst.Attribute | cst.Subscript) -> Meaning:
+    def _kept(self, function: Function, node: ast.Attribute | ast.Subscript) -> Meaning:
         """Return the meaning of what is assigned to a member here, or to ``self.name`` anywhere in its class."""
         local = self._flow(function, node) if function.flow.reaching(node) else UNKNOWN
-        own = node.attr.value if isinstance(node, cst.Attribute) and dotted(node.value) == "self" else ""
+        own = node.attr if isinstance(node, ast.Attribute) and dotted(node.value) == "self" else ""
         owner = self.program.owner_of(function) if own and local == UNKNOWN else None
         stores = owner.stores(own)[:6] if owner is not None else []
         kept = [self._definition(*each) for each in stores]
         table = function.flow.value_of(node.value)
-        literal = table.elements if isinstance(table, cst.Dict) and local == UNKNOWN else ()
-        named = [each for each in literal if isinstance(each, cst.DictElement) and constant(each.key) == key_of(node)]
-        kept += [self.meaning(function, each.value) for each in named]
+        literal = entries(table) if table is not None and local == UNKNOWN else ()
+        kept += [self.meaning(function, value) for key, value in literal if constant(key) == key_of(node)]
         return self._joined(frozenset(kept)) if kept else local
 
-    def _role_of_holder(self, function: Function, node: cst.CSTNode) -> Optional[str]:
+    def _role_of_holder(self, function: Function, node: ast.AST) -> Optional[str]:
         """Return the role from the container: ``outputs["rgb"]`` is rendered, ``batch["rgb"]`` a target."""
-        if isinstance(node, cst.Subscript):
+        if isinstance(node, ast.Subscript):
             return self._role_of_holder(function, node.value)
-        if not isinstance(node, (cst.Name, cst.Attribute)):
+        if not isinstance(node, (ast.Name, ast.Attribute)):
             return self.meaning(function, node).role
         name = root_of(node)
         role = role_of_words(name)
         if role is None and set(words(name)) & DATA:
             return "target"  # a camera may have been anywhere before
-        if isinstance(node, cst.Attribute):
+        if isinstance(node, ast.Attribute):
             return role or self._role_of_holder(function, node.value)
         return role or self._flow(function, node).role
 
@@ -204,7 +205,7 @@ class Meanings:
             return self._parameter(function, definition)
         if value is None or definition.kind in ("import", "function", "class"):
             return UNKNOWN
-        if isinstance(definition.node, cst.AugAssign) and definition.kind == "augment":
+        if isinstance(definition.node, ast.AugAssign) and definition.kind == "augment":
             return mix([self._flow(function, definition.node.target), self.meaning(function, value)])
         if definition.kind == "element" and definition.index is not None:
             meaning = self._element(function, value, definition.index)
@@ -212,28 +213,29 @@ class Meanings:
             return meaning._replace(role=None) if beside else meaning  # image, gt_image = render(...)
         if definition.kind == "part":
             return Meaning(None, self.meaning(function, value).role)
-        if definition.kind in ("mutate", "inplace") and isinstance(value, cst.Call):
+        if definition.kind in ("mutate", "inplace") and isinstance(value, ast.Call):
             return mix(self.meaning(function, part) for part in arguments(value)[0])
         return self.meaning(function, value)
 
-    def _element(self, function: Function, value: cst.CSTNode, index: int) -> Meaning:
+    def _element(self, function: Function, value: ast.AST, index: int) -> Meaning:
         """Return the meaning of an element of what is unpacked."""
         if _table_of(function, value) is not None and index == 1:
             return self.meaning(function, value)
-        if not isinstance(value, cst.Call):
+        if not isinstance(value, ast.Call):
             held = function.flow.value_of(value) or value
-            literal = held.elements if isinstance(held, (cst.Tuple, cst.List)) else ()
-            rows = [each.value.elements for each in literal if isinstance(each.value, (cst.Tuple, cst.List))]
+            literal = parts_of(held) if isinstance(held, (ast.Tuple, ast.List)) else ()
+            rows = [parts_of(each) for each in literal if isinstance(each, (ast.Tuple, ast.List))]
             if rows and all(len(row) > index for row in rows):  # for key, gt in (("render", image), ("depth", depth))
-                return mix(self.meaning(function, row[index].value) for row in rows)
+                return mix(self.meaning(function, row[index]) for row in rows)
             return Meaning(None, self.meaning(function, value).role)
-        given = arguments(value)[0]
+        positional = arguments(value)[0]
         if picked_from(value, index) >= 3:
             return Meaning("channel", self.meaning(function, value).role)
-        if call_name(value) == "zip" and index < len(given):
-            return self.meaning(function, given[index])
-        if call_name(value) == "split" and index == 0 and given and isinstance(value.func, cst.Attribute):
-            return self._first(function, value.func.value if constant(given[0]) is not None else given[0], True)
+        if call_name(value) == "zip" and index < len(positional):
+            return self.meaning(function, positional[index])
+        if call_name(value) == "split" and index == 0 and positional and isinstance(value.func, ast.Attribute):
+            of = value.func.value if constant(positional[0]) is not None else positional[0]
+            return self._first(function, of, True)
         # A renderer that returns a tuple returns the image first; the rest have names of their own.
         meaning = self.meaning(function, value)
         if meaning.kind == "image" and index > 0:
@@ -241,13 +243,13 @@ class Meanings:
         returned = self._returned(function, value, index, by_name=meaning.kind == "image")
         return returned if returned.kind is not None else meaning
 
-    def _returned(self, function: Function, call: cst.Call, index: int, by_name: bool) -> Meaning:
+    def _returned(self, function: Function, call: ast.Call, index: int, by_name: bool) -> Meaning:
         """Return the meaning of an element of a returned tuple; a renderer's may join depth and colours: by name."""
         found = []
         for callee in callees(self.program, function, call):
-            tuples = [value for value in callee.flow.returns if isinstance(value, cst.Tuple)]
-            for element in (each.elements[index].value for each in tuples if index < len(each.elements)):
-                says_image = isinstance(element, cst.Name) and kind_of_words(element.value) == "image"
+            tuples = [value for value in callee.flow.returns if isinstance(value, ast.Tuple)]
+            for element in (parts_of(each)[index] for each in tuples if index < len(each.elts)):
+                says_image = isinstance(element, ast.Name) and kind_of_words(element.id) == "image"
                 meaning = self.meaning(callee, element)
                 found.append(meaning._replace(kind="image") if by_name and says_image else meaning)
         return mix(found)
@@ -256,14 +258,14 @@ class Meanings:
         """Return the meaning of a parameter: that of its arguments where training calls the function."""
         if definition.place not in function.parameters:
             return UNKNOWN
-        given = self._given(function, definition.place)
-        found = [self.meaning(caller, value) for caller, _, value in given if value is not None]
+        calls = self._given(function, definition.place)
+        found = [self.meaning(caller, value) for caller, _, value in calls if value is not None]
         meaning = mix([meaning for meaning in found if meaning.kind == "image"] or found)
         owner = function.owner.name if function.owner is not None else ""
         says_kind = LOSS & set(words(owner)) and kind_of_words(owner) in ("depth", "normal", "flow")
         # What is nearer outweighs it: the parameter's name, or what one method is given that no other overrides.
         is_named = any(KIND_OF.get(word) == "image" and word not in RENDER for word in words(definition.place))
-        is_own = any((dotted(call.func) or "").startswith("self.") for _, call, _ in given)
+        is_own = any((dotted(call.func) or "").startswith("self.") for _, call, _ in calls)
         says_kind = says_kind and not (is_named or (meaning.kind == "image" and not is_own))
         return meaning._replace(kind=kind_of_words(owner)) if says_kind else meaning
 
@@ -273,52 +275,50 @@ class Meanings:
         return [(caller, call, function.given(call, parameter)) for caller, call in calls[:12]]
 
 
-def _table_of(function: Function, node: cst.CSTNode) -> Optional[cst.Dict]:
+def _table_of(function: Function, node: ast.AST) -> Optional[ast.Dict]:
     """Return the dictionary whose values are gone through: ``targets.values()``, ``targets.items()``."""
-    if not isinstance(node, cst.Call) or call_name(node) not in ("values", "items"):
+    if not isinstance(node, ast.Call) or call_name(node) not in ("values", "items"):
         return None
-    table = function.flow.value_of(node.func.value) if isinstance(node.func, cst.Attribute) else None
-    return table if isinstance(table, cst.Dict) else None
+    table = function.flow.value_of(node.func.value) if isinstance(node.func, ast.Attribute) else None
+    return table if isinstance(table, ast.Dict) else None
 
 
-def parts_of(node: cst.CSTNode) -> List[cst.CSTNode]:
+def parts_of(node: ast.AST) -> List[ast.AST]:
     """Return the parts of an operation whose meanings are those of the whole."""
-    if isinstance(node, (cst.BinaryOperation, cst.BooleanOperation)):
-        parts: List[cst.CSTNode] = [node.left, node.right]
-        has_only_its_shape = isinstance(node.operator, cst.Multiply) and 0 in map(constant, parts)  # image * 0 + color
-        return [] if has_only_its_shape else [part for part in parts if not _is_opacity(part, node)]
-    if isinstance(node, cst.IfExp):
+    if isinstance(node, (ast.BinOp, ast.BoolOp)):
+        parts: List[ast.AST] = [node.left, node.right] if isinstance(node, ast.BinOp) else [*node.values]
+        has_only_its_shape = isinstance(node.op, ast.Mult) and 0 in map(constant, parts)  # image * 0 + color
+        return [] if has_only_its_shape else [part for part in parts if not _is_opacity(part, parts, node.op)]
+    if isinstance(node, ast.IfExp):
         return [node.body, node.orelse]
-    if isinstance(node, (cst.Tuple, cst.List)):
-        return [element.value for element in node.elements]
-    if isinstance(node, (cst.ListComp, cst.GeneratorExp)):
+    if isinstance(node, (ast.Tuple, ast.List)):
+        return [each.value if isinstance(each, ast.Starred) else each for each in node.elts]
+    if isinstance(node, (ast.ListComp, ast.GeneratorExp)):
         return [node.elt]
-    return [node.expression] if isinstance(node, cst.UnaryOperation) else []
+    return [node.operand] if isinstance(node, ast.UnaryOp) else []
 
 
-def _cut(node: cst.Subscript) -> Tuple[object, object]:
+def _cut(node: ast.Subscript) -> Tuple[object, object]:
     """Return where the one cut of a tensor begins and ends; of a block of a matrix, or none, what no channel has."""
-    parts = [each.slice for each in node.slice]
-    cuts = [cut for cut in parts if isinstance(cut, cst.Slice) and code(cut) != ":"]
+    slices = [each for each in indices(node) if isinstance(each, ast.Slice)]
+    cuts = [each for each in slices if each.lower or each.upper or each.step]
     return (constant(cuts[0].lower), cuts[0].upper and constant(cuts[0].upper, 0)) if len(cuts) == 1 else (None, None)
 
 
-def is_fourth(node: cst.CSTNode) -> bool:
+def is_fourth(node: ast.AST) -> bool:
     """Return whether it is what lies behind the colours."""
-    if not isinstance(node, cst.Subscript):
+    if not isinstance(node, ast.Subscript):
         return False
     start, end = _cut(node)
-    last = node.slice[-1].slice if len(node.slice) > 1 else None
-    is_one = isinstance(last, cst.Index) and constant(last.value) == 3
+    is_one = len(indices(node)) > 1 and constant(indices(node)[-1]) == 3
     return is_one or (start == 3 and (end is None or (isinstance(end, int) and end > 3)))  # no border: 3:-3
 
 
-def _is_opacity(part: cst.CSTNode, node: cst.BinaryOperation | cst.BooleanOperation) -> bool:
+def _is_opacity(part: ast.AST, parts: Sequence[ast.AST], operator: ast.AST) -> bool:
     """Return whether a part of an operation is the opacity of a layer: ``1 - layer[3:]``, ``layer[3:] * layer[:3]``."""
     if not is_fourth(part):
         return False
-    left, right = node.left, node.right
-    colours = left if part is right else right
-    values = [each.value for each in walk_expressions(colours) if isinstance(each, cst.Subscript)]
+    colours = [each for each in parts if each is not part]
+    values = [each.value for each in walk_expressions(*colours) if isinstance(each, ast.Subscript)]
     is_over = any(same(value, part.value) for value in values)  # type: ignore[attr-defined]
-    return constant(left) == 1 if isinstance(node.operator, cst.Subtract) else is_over
+    return constant(parts[0]) == 1 if isinstance(operator, ast.Sub) else is_over

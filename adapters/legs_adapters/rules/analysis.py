@@ -11,7 +11,6 @@ from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.forms import Forms
 from legs_adapters.terms.functions import L1Functions
 from legs_adapters.terms.kinds.callback import Callbacks
-from legs_adapters.terms.prospects import Prospects
 
 
 class Analysis:
@@ -22,7 +21,6 @@ class Analysis:
 
     Attributes:
         program: its files, linked by names.
-        prospects: which text can lead to an L1.
         training: what its backward passes depend on.
         meanings, ways: what its expressions depict: by their names, too, and by the way they came alone.
         forms: its L1 expressions.
@@ -33,11 +31,10 @@ class Analysis:
 
     def __init__(self, program: Program) -> None:
         self.program = program
-        self.prospects: Prospects = Prospects(source.text for source in program.sources.values())
-        self.training: Training = Training(self.program, self.prospects.may_lead)
+        self.training: Training = Training(self.program)
         self.meanings: Meanings = Meanings(self.program, self.training)
         self.ways: Ways = Ways(self.program, self.training)
-        self.forms: Forms = Forms(L1Functions(self.program, self.prospects))
+        self.forms: Forms = Forms(L1Functions(self.program))
         self.purposes: Purposes = Purposes(self.program, self.training)
         self.splats: Splats = Splats(self.program, self.training, self.forms)
         self.callbacks: Callbacks = Callbacks(self.program, self.training, self.forms)

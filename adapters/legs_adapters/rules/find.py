@@ -37,8 +37,7 @@ _Entry = Tuple[Place, Union[Site, Left, Problem]]
 
 _RULES = 100  # steps at most of what all rules ask about a term
 _TEXT = 50  # letters of a text that are searched in a step
-_MAY_HAVE_L1 = re.compile(SPEAKS_OF_L1.pattern + r"|unweighted\(")
-_TO_READ = re.compile(f"{_MAY_HAVE_L1.pattern}|{TRAINS.pattern}|{'|'.join(sorted(HOOKS))}")
+_TO_READ = re.compile(rf"{SPEAKS_OF_L1.pattern}|unweighted\(|{TRAINS.pattern}|{'|'.join(sorted(HOOKS))}")
 
 
 def find(
@@ -60,11 +59,10 @@ def find(
         budget: the steps that it may take; default: its own.
     """
     program = Program(sources, MODULE_SELF, MODULE_WRAPS, budget)
-    named = set(program.paths_matching(_MAY_HAVE_L1))
-    with progress(len(named), "files read") as bar:  # half of a file when it is parsed, half when it was judged
-        program.when_read = lambda path: bar.update(0.5 * (path in named))
+    with progress(len(program.paths_matching(_TO_READ)), "files read") as bar:  # half when parsed, half when judged
+        program.when_read = lambda path: bar.update(0.5 * (path in program.paths_matching(_TO_READ)))
         analysis = Analysis(program)
-        found = _Search(analysis, by_hand, named, bar).run()
+        found = _Search(analysis, by_hand, bar).run()
     found = with_trace(found, analysis, trace) if trace is not None and not by_hand else found
     left = found.left
     found = with_ssims(found, analysis, by_hand) if ssim or masks else found
@@ -73,9 +71,8 @@ def find(
 
 
 class _Search:
-    def __init__(self, analysis: Analysis, by_hand: Sequence[Tuple[str, int]], named: Set[str], bar: Any) -> None:
-        self.analysis, self.named = analysis, named
-        self.bar = bar
+    def __init__(self, analysis: Analysis, by_hand: Sequence[Tuple[str, int]], bar: Any) -> None:
+        self.analysis, self.bar = analysis, bar
         self.by_hand: Dict[str, List[int]] = {}  # the lines that the user named, by their file
         for path, line in dict.fromkeys(by_hand):
             self.by_hand.setdefault(path, []).append(line)
@@ -85,20 +82,14 @@ class _Search:
 
     def run(self) -> Findings:
         found, program = self.found, self.analysis.program
-        may_have = self.analysis.prospects.may_have  # of an L1 that its callers do not name so
         for module in program.matching(_TO_READ):
-            is_named = module.path in self.named
-            if not is_named and not may_have(module.text):
-                continue
-            self.bar.update(0.5 * is_named)
+            self.bar.update(0.5)
             over = module.budget.why_none_left()
             if over:
                 program.give_up(module.path, over)
                 continue
             try:
                 self._module(module)
-            except ValueError as error:
-                program.give_up(module.path, str(error))
             except RecursionError:
                 program.give_up(module.path, "is nested too deeply")
         found.without(program.unreadable)
@@ -132,9 +123,7 @@ class _Search:
     def _module(self, module: Module) -> None:
         found = self.found
         entries: List[_Entry] = []
-        may_have = self.analysis.prospects.may_have
-        is_named = module.path in self.by_hand
-        for function in module.scopes(lambda text: is_named or may_have(text) or _MAY_HAVE_L1.search(text)):
+        for function in module.scopes(bool):
             if not module.spend(len(function.text) // _TEXT):
                 return
             entries += self._entries(function)

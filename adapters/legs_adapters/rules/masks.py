@@ -7,22 +7,22 @@ What else compares the two there may be a mean over all pixels, masked ones too:
 
 from __future__ import annotations
 
+import ast
 import bisect
-import itertools
 import math
 import re
 from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple, Union
 
-import libcst as cst
-
 from legs_adapters.code.limits import remembered
 from legs_adapters.code.module import Function, blocks_of
-from legs_adapters.code.parsing import Place
+from legs_adapters.code.parsing import Lines, Place
 from legs_adapters.code.reaching import Reaching
 from legs_adapters.code.syntax import (
+    FUNCTIONS,
     arguments,
     call_name,
     children,
+    given,
     one_line,
     path_of,
     walk_expressions,
@@ -37,7 +37,7 @@ from legs_adapters.terms.patched import patched_nodes
 from legs_adapters.terms.writing import PACKAGE
 
 _MASKED, _COVERAGE = f"{PACKAGE}.masked", f"{PACKAGE}.coverage"
-_Given = Tuple[cst.Call, List[Set[Optional[str]]]]  # a call, and what its arguments read
+_Given = Tuple[ast.Call, List[Set[Optional[str]]]]  # a call, and what its arguments read
 
 _MOST = 100  # expressions that a rendering is followed through
 
@@ -48,7 +48,7 @@ def with_masks(found: Findings, analysis: Analysis) -> Findings:
     for site in found.sites:
         form = site.form
         sides = (form.second, form.first) if site.swapped else (form.first, form.second)
-        whole = [side.value if site.selection and isinstance(side, cst.Subscript) else side for side in sides]
+        whole = [side.value if site.selection and isinstance(side, ast.Subscript) else side for side in sides]
         pair = _ImagePair(site.scope, form.node, whole[0], whole[1])
         if isinstance(form, PassedByName):
             masking.problems.append(pair.problem(site.scope, form.node, "the L1 is called elsewhere"))
@@ -66,15 +66,16 @@ class _ImagePair(NamedTuple):
     """The two images of a term, without the index by a mask that both carry; and the term, in its function."""
 
     function: Function
-    node: cst.BaseExpression
-    prediction: cst.BaseExpression
-    target: cst.BaseExpression
+    node: ast.expr
+    prediction: ast.expr
+    target: ast.expr
 
-    def form(self, after: Optional[cst.CSTNode] = None, before: Optional[cst.CSTNode] = None) -> Masked:
+    def form(self, after: Optional[ast.AST] = None, before: Optional[ast.AST] = None) -> Masked:
         """Return the line between two statements."""
-        return Masked(self.node, cst.Call(self.prediction), self.prediction, self.target, after=after, before=before)
+        call = ast.Call(self.prediction, [], [])
+        return Masked(self.node, call, self.prediction, self.target, after=after, before=before)
 
-    def problem(self, function: Function, node: cst.CSTNode, why: str) -> Problem:
+    def problem(self, function: Function, node: ast.AST, why: str) -> Problem:
         """Return the line as one to be written by hand, with the expression that is the reason."""
         is_named = path_of(self.prediction) is not None and path_of(self.target) is not None
         line = self.form().line if is_named else "give both images names, and mask the rendering on a line of its own"
@@ -95,7 +96,7 @@ class _MaskLine(NamedTuple):
         """The function and the place of the rendering."""
         return self.pair.function, path_of(self.pair.prediction)
 
-    def covers(self, node: cst.CSTNode) -> bool:
+    def covers(self, node: ast.AST) -> bool:
         """Return whether a node of its function comes after it, in its block."""
         return self.start <= self.pair.function.place(node).start < self.end
 
@@ -113,7 +114,6 @@ class _MaskLines:
         self.lines: Dict[Tuple[Function, Optional[str]], List[_MaskLine]] = {}  # by the rendering's function and place
         self.unnamed: List[_ImagePair] = []
         self.problems: List[Problem] = []
-        self._spans: Dict[int, List[Place]] = {}  # of the statements of a block, by its id
 
     def look_at_patched(self, entry: Left) -> None:
         """Take in the terms of a line that were weighted before."""
@@ -129,9 +129,9 @@ class _MaskLines:
         """Take in a term: the line of its rendering, or a problem."""
         made = pair.function.flow.value_of(pair.prediction)
         resolve = self.analysis.program.resolve
-        if isinstance(made, cst.Call) and any(r.target == _MASKED for r in resolve(pair.function, made.func)):
+        if isinstance(made, ast.Call) and any(r.target == _MASKED for r in resolve(pair.function, made.func)):
             return  # written before
-        if not isinstance(pair.prediction, cst.Name):
+        if not isinstance(pair.prediction, ast.Name):
             self.unnamed.append(pair)
             return
         line = self._line(pair)
@@ -178,8 +178,8 @@ class _MaskLines:
 
     def _leak(self, pair: _ImagePair) -> Optional[Decider]:
         """Return a read that takes what a rendering is made of into the loss, and comes after no line."""
-        work: List[Tuple[Function, cst.CSTNode]] = [(pair.function, pair.prediction)]
-        found: List[Tuple[Function, Optional[cst.CSTNode]]]
+        work: List[Tuple[Function, ast.AST]] = [(pair.function, pair.prediction)]
+        found: List[Tuple[Function, Optional[ast.AST]]]
         carriers: Dict[Tuple[Function, Optional[str]], None] = {}
         made_of: Set[int] = set()
         met: Set[Reaching] = set()
@@ -207,11 +207,11 @@ class _MaskLines:
         return None
 
     @remembered
-    def _reads(self, function: Function) -> Dict[Optional[str], List[cst.CSTNode]]:
+    def _reads(self, function: Function) -> Dict[Optional[str], List[ast.AST]]:
         """Return the reads of a function that a backward pass reaches, by their places."""
         training = self.analysis.training
-        found: Dict[Optional[str], List[cst.CSTNode]] = {}
-        for read in _places(function.body):
+        found: Dict[Optional[str], List[ast.AST]] = {}
+        for read in _places(*function.body):
             if training.includes(read) or not training.touches(function):
                 found.setdefault(path_of(read), []).append(read)
         return found
@@ -221,66 +221,60 @@ class _MaskLines:
         """Return the trained calls of a function, by each place that they are given, with the places in arguments."""
         found: Dict[Optional[str], List[_Given]] = {}
         for call in filter(self.analysis.training.includes, function.flow.calls):
-            given = [{path_of(part) for part in _places(each)} for each in arguments(call)[0]]
-            for path in set().union(*given) if function.module.spend(1 + sum(map(len, given))) else ():
-                found.setdefault(path, []).append((call, given))
+            read = [{path_of(part) for part in _places(each)} for each in arguments(call)[0]]
+            for path in set().union(*read) if function.module.spend(1 + sum(map(len, read))) else ():
+                found.setdefault(path, []).append((call, read))
         return found
 
     def _line(self, pair: _ImagePair) -> Union[_MaskLine, str]:
         """Return the line, in the outermost block in which both images are defined before the term; or why not."""
         function, reaching = pair.function, pair.function.flow.reaching
         parts = [part for side in (pair.prediction, pair.target) for part in walk_expressions(side)]
-        if not reaching(pair.prediction) or any(isinstance(part, cst.Call) for part in parts):
+        if not reaching(pair.prediction) or any(isinstance(part, ast.Call) for part in parts):
             return "the images have no names here"
         made = [list(reaching(part)) for part in parts]
         starts = [[function.place(each.node).start for each in some if each.kind != "parameter"] for some in made]
         last = max((start for some in starts for start in some), default=-1)
-        function.module.spend(sum(map(len, starts)))
-        names = [(some, at) for part, some, at in zip(parts, made, starts) if isinstance(part, cst.Name)]
+        names = [(some, at) for part, some, at in zip(parts, made, starts) if isinstance(part, ast.Name)]
         unbound = [at for some, at in names if at and len(at) == len(some)]
-        for block, places, index in self._blocks_around(function, pair.node):
+        function.module.spend(sum(map(len, starts)))
+        for block, places, index in _blocks_around(function, pair.node):
             here, earlier = places[index].start <= last, _last_before(places, last)
             after = index - 1 if here or earlier < 0 else earlier
-            end = places[after].end if after >= 0 else -1
-            unbound = [some for some in unbound if not self._bind(function, block, [at for at in some if at < end])]
-            if not here and not unbound:
+            before = block[: after + 1]
+            unbound = [some for some in unbound if not any(_binds(function, each, some) for each in before)]
+            if not here and not unbound and _begins_line(function.module.lines, places[after + 1]):
                 form = pair.form(block[after] if after >= 0 else None, block[after + 1])
                 return _MaskLine(pair, form, places[after + 1].start, places[-1].end)
         return "no line before the term surely comes after both images"
 
-    def _bind(self, function: Function, block: Sequence[cst.CSTNode], starts: Sequence[int]) -> bool:
-        """Return whether the statements of a block surely make one of the definitions that begin there."""
-        places = self._statements(function, block)
-        groups = itertools.groupby(starts, lambda at: _last_before(places, at))
-        inside = [(block[i], [at for at in some if at < places[i].end]) for i, some in groups if i >= 0]
-        return any(self._binds(function, node, some) for node, some in inside if some)
 
-    def _binds(self, function: Function, node: cst.CSTNode, starts: Sequence[int]) -> bool:
-        """Return whether a statement makes one of the definitions that begin in it, in each of its branches."""
-        if isinstance(node, (cst.If, cst.Else, cst.With)):
-            other = node.orelse if isinstance(node, cst.If) else node
-            inside = other is not None and self._bind(function, node.body.body, starts)
-            return inside and other is not None and (other is node or self._binds(function, other, starts))
-        return isinstance(node, cst.SimpleStatementLine)
+def _binds(function: Function, node: ast.stmt, starts: Sequence[int]) -> bool:
+    """Return whether a statement makes one of the definitions that begin there, in each of its branches."""
+    place = function.place(node)
+    inside = [at for at in starts if place.start <= at < place.end]
+    if inside and isinstance(node, (ast.If, ast.With, ast.AsyncWith)):
+        branches = [node.body, node.orelse] if isinstance(node, ast.If) else [node.body]
+        return all(any(_binds(function, each, inside) for each in branch) for branch in branches)
+    return bool(inside) and not any(blocks_of(node))
 
-    def _blocks_around(
-        self, function: Function, node: cst.CSTNode
-    ) -> Iterator[Tuple[Sequence[cst.CSTNode], List[Place], int]]:
-        """Yield the blocks around a node, the outermost first, each with the index of the statement around it."""
-        start = function.place(node).start
-        blocks: List[Sequence[cst.CSTNode]] = [function.body.body]
-        for block in blocks:  # which grows
-            places = self._statements(function, block)
-            index = _last_before(places, start)
-            is_small = isinstance(block[index], cst.BaseSmallStatement)  # on the line of its if
-            if index >= 0 and start < places[index].end and not is_small:
-                yield block, places, index
-                blocks += blocks_of(block[index])
 
-    def _statements(self, function: Function, block: Sequence[cst.CSTNode]) -> List[Place]:
-        if id(block) not in self._spans:
-            self._spans[id(block)] = [function.place(statement) for statement in block]
-        return self._spans[id(block)]
+def _blocks_around(function: Function, node: ast.AST) -> Iterator[Tuple[List[ast.stmt], List[Place], int]]:
+    """Yield the blocks around a node, the outermost first, with their places and the index of the statement around."""
+    start = function.place(node).start
+    blocks: List[List[ast.stmt]] = [function.body]
+    for block in blocks:  # which grows
+        places = [function.place(statement) for statement in block]
+        index = _last_before(places, start)
+        if index >= 0 and start < places[index].end:
+            yield block, places, index
+            blocks += blocks_of(block[index])
+
+
+def _begins_line(lines: Lines, place: Place) -> bool:
+    """Return whether a statement is the first thing on its line, and that line no continued one."""
+    is_continued = place.line > 1 and lines.text(place.line - 1).endswith("\\")
+    return not is_continued and not lines.data[lines.start(place.line) : place.start].strip()
 
 
 def _last_before(places: Sequence[Place], at: int) -> int:
@@ -288,15 +282,15 @@ def _last_before(places: Sequence[Place], at: int) -> int:
     return bisect.bisect_right(places, (at, math.inf)) - 1
 
 
-def _places(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
-    """Yield the places that are read in a node, ``pkg['render']`` and not the ``pkg`` in it, but for depth channels."""
-    stack = [node]
+def _places(*nodes: ast.AST) -> Iterator[ast.AST]:
+    """Yield the places that are read in nodes, ``pkg['render']`` and not the ``pkg`` in it, but for depth channels."""
+    stack = list(nodes)
     while stack:
         part = stack.pop()
         if path_of(part) is not None:
             yield part
-        elif isinstance(part, cst.Call):
-            stack += [arg.value for arg in part.args]
-            stack.append(part.func.value if isinstance(part.func, cst.Attribute) else part.func)
-        elif not isinstance(part, (cst.FunctionDef, cst.ClassDef)) and not is_fourth(part):
+        elif isinstance(part, ast.Call):
+            stack += [arg.value for arg in given(part)]
+            stack.append(part.func.value if isinstance(part.func, ast.Attribute) else part.func)
+        elif not isinstance(part, (*FUNCTIONS, ast.ClassDef)) and not is_fourth(part):
             stack += children(part)

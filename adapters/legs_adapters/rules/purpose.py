@@ -5,11 +5,10 @@ An L1 whose gradients update only poses is tracking; one whose gradients are onl
 
 from __future__ import annotations
 
+import ast
 import itertools
 import re
 from typing import Any, Callable, Dict, List, Optional, Sequence, Set, Tuple, TypeVar
-
-import libcst as cst
 
 from legs_adapters.code.calls import callees, given_to, likely_calls, values_of
 from legs_adapters.code.limits import remembered
@@ -22,6 +21,8 @@ from legs_adapters.code.syntax import (
     call_name,
     constant,
     dotted,
+    entries,
+    given,
     walk_expressions,
     words,
     words_in,
@@ -35,8 +36,8 @@ from legs_adapters.terms.findings import Evidence
 _T = TypeVar("_T")
 _DEPTH = 3
 # With the optimiser, the words of whose method runs it, and the calls that made those.
-_Step = Tuple[Function, cst.Call, cst.BaseExpression, Set[str], List[Tuple[Function, cst.Call]]]
-_Value = Tuple[Function, cst.CSTNode]
+_Step = Tuple[Function, ast.Call, ast.expr, Set[str], List[Tuple[Function, ast.Call]]]
+_Value = Tuple[Function, ast.AST]
 _STEPS = re.compile(r"step(?:(?!step)\w)*\s*\(")
 _CALLED = re.compile(r"\b(\w+)\s*\(")
 _SETS_RATES = re.compile(r"""\[["']lr["']\]\s*[-+*/]?=[^=]|add_param_group|CyclicLR|OneCycleLR""")
@@ -51,41 +52,41 @@ class Purposes:
         self.training = training
         self._known: Dict[Tuple[str, Function, Tuple[int, ...], int], Any] = {}
 
-    def purpose(self, function: Function, node: cst.CSTNode, depth: int = 0) -> Optional[Evidence]:
+    def purpose(self, function: Function, node: ast.AST, depth: int = 0) -> Optional[Evidence]:
         """Return the evidence that the backward pass of an expression trains no Gaussians; None where it may."""
         score = self.training.scores(node)
         if score is not None:
             return Evidence("no-step", "scoring", [score])
         return self._once(self._purpose, function, node, depth)
 
-    def of_call(self, function: Function, node: cst.CSTNode, caller: Function, call: cst.Call) -> Optional[Evidence]:
+    def of_call(self, function: Function, node: ast.AST, caller: Function, call: ast.Call) -> Optional[Evidence]:
         """Return the evidence that one call of a function trains no Gaussians: by its step, or optimiser."""
         if not any(map(is_backward, function.flow.calls)):
             return self.purpose(caller, call)
         steps = self._after(function, node)[1]
-        given = [(step, function.given(call, step[2].value)) for step in steps if isinstance(step[2], cst.Name)]
+        given = [(step, function.given(call, step[2].id)) for step in steps if isinstance(step[2], ast.Name)]
         moved = [self._moved((caller, step[1], value, set(), [])) for step, value in given if value is not None]
         is_of_poses = bool(moved) and len(moved) == len(steps) and all(map(_are_poses, moved))
         return Evidence("pose-step", "tracking", [(caller, call)]) if is_of_poses else None
 
-    def moves_gaussians(self, function: Function, node: cst.CSTNode, depth: int = 0) -> bool:
+    def moves_gaussians(self, function: Function, node: ast.AST, depth: int = 0) -> bool:
         """Return whether an optimiser that steps after the backward pass of an expression is known to have them."""
         return self._once(self._moves, function, node, depth)
 
-    def _once(self, ask: Callable[..., _T], function: Function, node: cst.CSTNode, depth: int) -> _T:
+    def _once(self, ask: Callable[..., _T], function: Function, node: ast.AST, depth: int) -> _T:
         """Ask once for the terms of a round of a loop: the step after them is the same."""
         known = ask.__name__, function, tuple(map(id, function.flow.loops_around(node))), depth
         if known not in self._known:
             self._known[known] = ask(function, node, depth)
         return self._known[known]
 
-    def _moves(self, function: Function, node: cst.CSTNode, depth: int) -> bool:
+    def _moves(self, function: Function, node: ast.AST, depth: int) -> bool:
         if not any(map(is_backward, function.flow.calls)):
             sites = self.training.sites.get(function, []) if depth < _DEPTH else []
             return any(self.moves_gaussians(caller, call, depth + 1) for caller, call in sites)
         return any(self._moved(step) & (GAUSSIANS | TENSORS) for step in self._after(function, node)[1])
 
-    def _purpose(self, function: Function, node: cst.CSTNode, depth: int) -> Optional[Evidence]:
+    def _purpose(self, function: Function, node: ast.AST, depth: int) -> Optional[Evidence]:
         if not any(map(is_backward, function.flow.calls)):
             sites = self.training.sites.get(function, []) if depth < _DEPTH else []
             purposes = [self.purpose(caller, call, depth + 1) for caller, call in sites]
@@ -102,13 +103,13 @@ class Purposes:
         # What is drawn is asked last: it reads much that nothing else does.
         return Evidence("other-step", "tracking", first) if is_other and self._draws_a_model(function, 0) else None
 
-    def _after(self, function: Function, node: cst.CSTNode) -> Tuple[Optional[cst.Call], List[_Step]]:
+    def _after(self, function: Function, node: ast.AST) -> Tuple[Optional[ast.Call], List[_Step]]:
         """Return the steps after the backward pass of an expression; and that pass, where none follows it."""
         passes = [call for call in function.flow.calls if is_backward(call)]
         at = function.place(node).start
         own = next((call for call in passes if function.place(call).end > at), passes[0])
         may_train = self._may_train(function, own, 0, False)
-        inner: List[cst.Call] = []  # the backward passes of the innermost loop that has one
+        inner: List[ast.Call] = []  # the backward passes of the innermost loop that has one
         for loop in [*function.flow.loops_around(node), None]:
             calls = [call for call in function.flow.calls if loop is None or loop in function.flow.loops_around(call)]
             within = [call for call in calls if is_backward(call)]
@@ -121,22 +122,22 @@ class Purposes:
                 return None, steps
         return None if may_train else own, []
 
-    def _steps(self, function: Function, call: cst.Call, depth: int = 0) -> List[_Step]:
+    def _steps(self, function: Function, call: ast.Call, depth: int = 0) -> List[_Step]:
         """Return the steps of a call: its own, or those of the functions that it calls and that take no gradient."""
-        if isinstance(call.func, cst.Attribute) and is_step(call):
+        if isinstance(call.func, ast.Attribute) and is_step(call):
             return [(function, call, call.func.value, set(), [])]
         name = call_name(call)
         if name not in self._stepping() or depth > _DEPTH:
             return []
         found = callees(self.program, function, call)
-        if not found and isinstance(call.func, cst.Attribute):
+        if not found and isinstance(call.func, ast.Attribute):
             found = self.program.methods_named(name)  # one of them may run
         steps = [step for each in found for inner in each.flow.calls for step in self._steps(each, inner, depth + 1)]
-        holder = call.func.value if isinstance(call.func, cst.Attribute) else None
+        holder = call.func.value if isinstance(call.func, ast.Attribute) else None
         if holder is None or not steps:
             return steps
         makers = [(by, each.value) for by, each in _definitions(self.program, function, holder)]
-        made = [(by, value) for by, value in makers if isinstance(value, cst.Call)]
+        made = [(by, value) for by, value in makers if isinstance(value, ast.Call)]
         return [(where, step, of, said | words_in(holder), by + made) for where, step, of, said, by in steps]
 
     @remembered
@@ -151,7 +152,7 @@ class Purposes:
                 found = {name for name, called in calls if called & found}
         return known
 
-    def _may_train(self, function: Function, call: cst.Call, depth: int, read: bool) -> bool:
+    def _may_train(self, function: Function, call: ast.Call, depth: int, read: bool) -> bool:
         """Return whether a step may follow a call, in its function or then in the callers.
 
         None does where gradients are read and then reset, or where the script, or a function that reads them, ends.
@@ -177,10 +178,10 @@ class Purposes:
     def _moved(self, step: _Step) -> Set[str]:
         """Return the words in an optimiser's name, and in the parameters that it was made with."""
         function, _, optimiser, said, makers = step
-        name = set(words(optimiser.attr.value)) if isinstance(optimiser, cst.Attribute) else set()
+        name = set(words(optimiser.attr)) if isinstance(optimiser, ast.Attribute) else set()
         found = said | (name if name & POSES else words_in(optimiser))  # gaussians.optimizer_cam moves cameras
-        for where, given in self._given(function, optimiser, makers):
-            found |= set().union(*(_named_in(leaf) for _, leaf in self._leaves(where, given)))
+        for each in self._given(function, optimiser, makers):
+            found |= set().union(*(_named_in(leaf) for _, leaf in self._leaves(*each)))
         return found - PLUMBING
 
     def _moved_by(self, step: _Step) -> Optional[List[_Value]]:
@@ -189,10 +190,9 @@ class Purposes:
         given = self._given(function, optimiser, makers)
         return [leaf for each in given for leaf in self._leaves(*each)] if given else None
 
-    def _is_still(self, node: cst.CSTNode) -> bool:
+    def _is_still(self, node: ast.AST) -> bool:
         """Return whether it is a group of parameters with the rate 0, in a checkout that sets no rate later."""
-        literal = [each for each in getattr(node, "elements", ()) if isinstance(each, cst.DictElement)]
-        rates = [constant(each.value) for each in literal if constant(each.key) == "lr"]
+        rates = [constant(value) for key, value in entries(node) if constant(key) == "lr"]
         return rates == [0] and not self._sets_rates()
 
     @remembered
@@ -200,7 +200,7 @@ class Purposes:
         return any(_SETS_RATES.search(source.text) for source in self.program.sources.values())
 
     def _given(
-        self, function: Function, optimiser: cst.CSTNode, makers: Sequence[Tuple[Function, cst.Call]], depth: int = 0
+        self, function: Function, optimiser: ast.AST, makers: Sequence[Tuple[Function, ast.Call]], depth: int = 0
     ) -> List[_Value]:
         """Return what an optimiser was made with, or what is passed for it where that is not known."""
         found: List[_Value] = []
@@ -219,57 +219,56 @@ class Purposes:
                 found += self._passed(by, of, makers) or [(by, of)]
         return found
 
-    def _made_with(self, where: Function, made: Optional[cst.CSTNode]) -> List[_Value]:
+    def _made_with(self, where: Function, made: Optional[ast.AST]) -> List[_Value]:
         """Return what an optimiser is made with, in a helper too; nothing for what makes none."""
         of = _optimised(made)
         returned = values_of(self.program, where, made) if of is None else []
         inner = [(helper, _optimised(value)) for helper, value in returned]
-        passed = [helper.given(made, own.value) for helper, own in inner if isinstance(own, cst.Name)]  # type: ignore[arg-type]
+        passed = [helper.given(made, own.id) for helper, own in inner if isinstance(own, ast.Name)]  # type: ignore[arg-type]
         return [(where, each) for each in [of, *passed] if each is not None]
 
-    def _passed(self, where: Function, of: cst.CSTNode, makers: Sequence[Tuple[Function, cst.Call]]) -> List[_Value]:
+    def _passed(self, where: Function, of: ast.AST, makers: Sequence[Tuple[Function, ast.Call]]) -> List[_Value]:
         """Return what a parameter of a constructor was given, where calls are known that made the object."""
-        if where.name != "__init__" or not isinstance(of, cst.Name) or not where.is_parameter(of):
+        if where.name != "__init__" or not isinstance(of, ast.Name) or not where.is_parameter(of):
             return []
         owner, resolve = self.program.owner_of(where), self.program.resolve
         of_class = [each for each in makers if owner in [made.target for made in resolve(each[0], each[1].func)]]
-        given = [(by, where.given(maker, of.value)) for by, maker in of_class]
+        given = [(by, where.given(maker, of.id)) for by, maker in of_class]
         return [(by, value) for by, value in given if value is not None]
 
     def _is_beside(self, step: _Step) -> bool:
         """Return whether an optimiser has tensors alone that are made for it, none for each Gaussian."""
-        leaves = [leaf for leaf in self._moved_by(step) or () if not isinstance(leaf[1], cst.SimpleString)]
-        values: List[Tuple[Function, Optional[cst.CSTNode]]] = []
+        leaves = [leaf for leaf in self._moved_by(step) or () if not isinstance(constant(leaf[1]), str)]
+        values: List[Tuple[Function, Optional[ast.AST]]] = []
         for leaf in leaves:
             made = [(where, each.value) for where, each in _definitions(self.program, *leaf)]
             values += made or [leaf]
         return bool(leaves) and all(_is_own_tensor(self.program, *value) for value in values)
 
-    def _leaves(self, function: Function, node: cst.CSTNode, depth: int = 0) -> List[_Value]:
+    def _leaves(self, function: Function, node: ast.AST, depth: int = 0) -> List[_Value]:
         """Return the parameters in ``[{"params": [a, b]}, c]``, or in a name of such a list."""
         if self._is_still(node):
             return []
-        entries = self._within(function, node) if depth <= _DEPTH else []
-        return [leaf for each in entries for leaf in self._leaves(*each, depth + 1)] if entries else [(function, node)]
+        inner = self._within(function, node) if depth <= _DEPTH else []
+        return [leaf for each in inner for leaf in self._leaves(*each, depth + 1)] if inner else [(function, node)]
 
-    def _within(self, function: Function, node: cst.CSTNode) -> List[_Value]:
+    def _within(self, function: Function, node: ast.AST) -> List[_Value]:
         """Return what a list, a group of parameters, or a name of a list has in it; nothing for anything else."""
-        entries: List[Optional[cst.CSTNode]] = []
-        if isinstance(node, (cst.List, cst.Tuple)):
-            entries = [element.value for element in node.elements]
-        elif isinstance(node, cst.Dict):
-            literal = [each for each in node.elements if isinstance(each, cst.DictElement)]
-            entries = [each.value for each in literal if constant(each.key) in ("params", "name")]
-        elif isinstance(node, cst.Name):
+        found: Sequence[Optional[ast.AST]] = []
+        if isinstance(node, (ast.List, ast.Tuple)):
+            found = _entries(node)
+        elif isinstance(node, ast.Dict):
+            found = [value for key, value in entries(node) if constant(key) in ("params", "name")]
+        elif isinstance(node, ast.Name):
             values = function.flow.assigned(node)
             lists = [(function, value) for value in values]
             lists += [each for value in values for each in values_of(self.program, function, value)]
-            return [each for each in lists if isinstance(each[1], (cst.List, cst.Tuple, cst.Dict))]
-        elif isinstance(node, cst.Call) and isinstance(node.func, cst.Attribute) and call_name(node) == "values":
-            entries = _entries(function.flow.value_of(node.func.value))
-        elif isinstance(node, cst.Call) and call_name(node) == "list":
-            entries = [arg.value for arg in node.args]
-        return [(function, each) for each in entries if each is not None]
+            return [each for each in lists if isinstance(each[1], (ast.List, ast.Tuple, ast.Dict))]
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and call_name(node) == "values":
+            found = _entries(function.flow.value_of(node.func.value))
+        elif isinstance(node, ast.Call) and call_name(node) == "list":
+            found = [arg.value for arg in given(node)]
+        return [(function, each) for each in found if each is not None]
 
     @remembered
     def _draws_a_model(self, function: Function, depth: int) -> bool:
@@ -286,45 +285,47 @@ def _are_poses(moved: Set[str]) -> bool:
     return bool(moved & (POSES | EMBEDDING)) and not moved & MODELS
 
 
-def _definitions(program: Program, function: Function, node: cst.CSTNode) -> List[Tuple[Function, Definition]]:
+def _definitions(program: Program, function: Function, node: ast.AST) -> List[Tuple[Function, Definition]]:
     """Return the definitions of a name, or of what the methods of its class assign to ``self.name``."""
     found, owner = program.lookup(function, node), program.owner_of(function)
     if found is not None:
         return [(found[0], made) for made in found[1]]
-    if owner is not None and isinstance(node, cst.Attribute) and dotted(node.value) == "self":
-        return owner.stores(node.attr.value)
+    if owner is not None and isinstance(node, ast.Attribute) and dotted(node.value) == "self":
+        return owner.stores(node.attr)
     return []
 
 
-def _optimised(made: Optional[cst.CSTNode]) -> Optional[cst.CSTNode]:
+def _optimised(made: Optional[ast.AST]) -> Optional[ast.AST]:
     """Return what an optimiser is made with; None for what makes none."""
-    if not isinstance(made, cst.Call) or not _OPTIMISER.search(call_name(made)):
+    if not isinstance(made, ast.Call) or not _OPTIMISER.search(call_name(made)):
         return None
     positional, keywords, _ = arguments(made)
     return keywords.get("params") or next(iter(positional), None)
 
 
-def _named_in(given: cst.CSTNode) -> Set[str]:
+def _named_in(leaf: ast.AST) -> Set[str]:
     """Return the words of what is given; of ``[cam.pose for cam in scene.cameras]`` those of the pose."""
-    elements = words_in(given.elt) - PLUMBING if isinstance(given, cst.ListComp) else set()
-    return elements if elements & (POSES | EMBEDDING | MODELS) else words_in(given)
+    elements = words_in(leaf.elt) - PLUMBING if isinstance(leaf, ast.ListComp) else set()
+    return elements if elements & (POSES | EMBEDDING | MODELS) else words_in(leaf)
 
 
-def _entries(value: Optional[cst.CSTNode]) -> List[Optional[cst.CSTNode]]:
+def _entries(value: Optional[ast.AST]) -> List[Optional[ast.AST]]:
     """Return the values in a dict or a list, or what a comprehension makes one of; else the value itself."""
-    if isinstance(value, (cst.Dict, cst.List, cst.Tuple)):
-        return [element.value for element in value.elements]
-    return [value.elt if isinstance(value, cst.ListComp) else value.value if isinstance(value, cst.DictComp) else value]
+    if isinstance(value, (ast.List, ast.Tuple)):
+        return [each.value if isinstance(each, ast.Starred) else each for each in value.elts]
+    if isinstance(value, ast.Dict):
+        return list(value.values)
+    return [value.elt if isinstance(value, ast.ListComp) else value.value if isinstance(value, ast.DictComp) else value]
 
 
-def _is_own_tensor(program: Program, function: Function, value: Optional[cst.CSTNode]) -> bool:
+def _is_own_tensor(program: Program, function: Function, value: Optional[ast.AST]) -> bool:
     """Return whether a value is a new tensor, also by a helper, whose values and sizes are none of Gaussians."""
-    made = [part for part in attribute_chain(value) if isinstance(part, cst.Call)] if value is not None else []
+    made = [part for part in attribute_chain(value) if isinstance(part, ast.Call)] if value is not None else []
     if not made:
         return False
-    sizes = [part for arg in made[-1].args for part in walk_expressions(arg.value)]
+    sizes = [part for arg in given(made[-1]) for part in walk_expressions(arg.value)]
     sizes += [each for part in sizes for each in function.flow.assigned(part)]
-    counts = [part for part in sizes if isinstance(part, cst.Call) and call_name(part) == "len"]
+    counts = [part for part in sizes if isinstance(part, ast.Call) and call_name(part) == "len"]
     if words_in(*sizes) & TENSORS or words_in(*counts) & GAUSSIANS:
         return False
     helpers = values_of(program, function, made[-1])

@@ -7,13 +7,12 @@ are asked.
 
 from __future__ import annotations
 
+import ast
 import inspect
 from typing import TYPE_CHECKING, Callable, Iterator, List, Optional, Sequence, Tuple
 
-import libcst as cst
-
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import walk_expressions
+from legs_adapters.code.syntax import constant, name_of, walk_expressions
 from legs_adapters.lexicon.masks import is_rows
 from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.terms.findings import Decider
@@ -46,11 +45,11 @@ class Term:
         self.pair: Pair = pair_of(analysis.meanings, analysis.ways, function, form)
         first, second = self.pair.first, self.pair.second
         is_swapped = swapped(self.pair.a, self.pair.b)
-        self.target: cst.BaseExpression = first if is_swapped else second
-        self.prediction: cst.BaseExpression = second if is_swapped else first
+        self.target: ast.expr = first if is_swapped else second
+        self.prediction: ast.expr = second if is_swapped else first
 
     @property
-    def sides(self) -> Sequence[cst.BaseExpression]:
+    def sides(self) -> Sequence[ast.expr]:
         """Both sides as they are written."""
         return self.form.first, self.form.second
 
@@ -71,7 +70,7 @@ class Term:
         yield self.function.name, header(self.function)
         owner = self.analysis.program.owner_of(self.function)
         if owner is not None:
-            yield owner.name, (owner.parent, owner.node.name)
+            yield owner.name, (owner.parent, owner.node)
 
 
 class Rule:
@@ -113,7 +112,7 @@ def header(function: Function) -> Decider:
 
 
 def source_of(
-    function: Function, node: cst.CSTNode, says: Optional[Callable[[str], bool]] = None, depth: int = 0
+    function: Function, node: ast.AST, says: Optional[Callable[[str], bool]] = None, depth: int = 0
 ) -> Optional[Decider]:
     """Return the name, string or definition that decides: in an expression, or in the values that it is made from.
 
@@ -124,8 +123,9 @@ def source_of(
         depth: how many definitions were followed already.
     """
     parts = list(walk_expressions(node))
-    for part in parts:
-        if says is not None and isinstance(part, (cst.Name, cst.SimpleString)) and says(part.value):
+    for part in parts if says is not None else ():
+        text = constant(part) if isinstance(part, ast.Constant) else name_of(part)
+        if says is not None and isinstance(text, str) and says(text):
             return function, part
     definitions = [made for part in parts for made in function.flow.reaching(part)]
     for made in definitions if depth < _DEPTH else ():

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import ast
 import re
-
-import libcst as cst
 
 from legs_adapters.code.limits import remembered
 from legs_adapters.code.module import Function, Module
@@ -42,7 +41,7 @@ class Splats:
     def _takes_splats(self, module: Module) -> bool:
         """Return whether a file imports a Gaussian class, ``GazeGaussianNet``, from one that mentions splats."""
         taken = [node for node in module.top.flow.imports if "gaussian" in code(node).lower()]
-        found = [self.program.imported_from(module, node) for node in taken if isinstance(node, cst.ImportFrom)]
+        found = [self.program.imported_from(module, node) for node in taken if isinstance(node, ast.ImportFrom)]
         return any(made is not None and self._speaks(made.path, DRAWS_SPLATS) for made in found)
 
     @remembered

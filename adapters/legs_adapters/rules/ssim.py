@@ -22,12 +22,9 @@ def with_ssims(found: Findings, analysis: Analysis, by_hand: Sequence[Tuple[str,
     entries: List[Union[Site, Left]] = []
     for module in found.program.matching(STRUCTURAL):
         is_chosen = any(path == module.path for path, _ in by_hand)
-        try:
-            for function in module.scopes(STRUCTURAL.search):
-                if is_chosen or function in weighted or patched_nodes(analysis.program, function):
-                    entries += _in_function(analysis, function, found, by_hand)
-        except ValueError:
-            continue  # it cannot be written back exactly
+        for function in module.scopes(STRUCTURAL.search):
+            if is_chosen or function in weighted or patched_nodes(analysis.program, function):
+                entries += _in_function(analysis, function, found, by_hand)
     sites = [entry for entry in entries if isinstance(entry, Site)]
     left = [entry for entry in entries if isinstance(entry, Left) and entry.reason != "patched"]
     patched = [entry for entry in entries if isinstance(entry, Left) and entry.reason == "patched"]

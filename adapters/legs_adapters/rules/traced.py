@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import ast
 from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple
-
-import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import arguments, call_name, one_line, walk_expressions
@@ -109,7 +108,7 @@ class _Join:
     def _leads_to(self, form: Form, inner: Frame) -> bool:
         """Return whether a form's own call led to a frame, and not a call in its arguments, as `render(camera)`."""
         inside = (node for side in (form.first, form.second) for node in walk_expressions(side))
-        within = {call_name(node) for node in inside if isinstance(node, cst.Call)}
+        within = {call_name(node) for node in inside if isinstance(node, ast.Call)}
         if inner.name in ("forward", "__call__"):
             return not within or self._is_pair(inner)
         return inner.name not in within or inner.name == call_name(form.call)
@@ -248,6 +247,6 @@ class _Join:
         return next((name for name in reversed(names) if name), "")
 
 
-def _on(function: Function, node: cst.CSTNode, line: int) -> bool:
+def _on(function: Function, node: ast.AST, line: int) -> bool:
     place = function.place(node)
     return place.line <= line <= place.last_line

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import ast
 from typing import Iterator, List, Optional, Sequence, Tuple
-
-import libcst as cst
 
 from legs_adapters.code.calls import likely_calls
 from legs_adapters.code.module import Function
@@ -19,7 +18,7 @@ from legs_adapters.rules.rule import Term
 from legs_adapters.terms.findings import Evidence, Use
 from legs_adapters.terms.sides import surest
 
-_Call = Tuple[Function, cst.Call, List[Optional[cst.BaseExpression]]]
+_Call = Tuple[Function, ast.Call, List[Optional[ast.expr]]]
 _DEPTH = 3  # functions that hand on what they are given
 
 
@@ -27,8 +26,8 @@ def uses_of(analysis: Analysis, term: Term) -> List[Use]:
     """Classify the calls, in the training step, of a function that compares two pictures."""
     found: List[Use] = []
     function, target = term.function, term.target
-    names = [side.value for side in (term.prediction, target) if isinstance(side, cst.Name)]
-    is_given = isinstance(target, cst.Name) and target.value in function.parameters
+    names = [side.id for side in (term.prediction, target) if isinstance(side, ast.Name)]
+    is_given = isinstance(target, ast.Name) and target.id in function.parameters
     for caller, call, sides in _calls(analysis, function, names):
         image = sides[-1] if is_given else None
         if is_given and arguments(call)[2]:  # starred
@@ -51,7 +50,7 @@ def _calls(analysis: Analysis, function: Function, names: Sequence[str], depth: 
     sites = analysis.training.sites
     for caller, call in sites.get(function) or likely_calls(analysis.program, function):
         sides = [function.given(call, name) for name in names]
-        own = [side.value for side in sides if isinstance(side, cst.Name) and caller.is_parameter(side)]
+        own = [side.id for side in sides if isinstance(side, ast.Name) and caller.is_parameter(side)]
         if len(own) == len(names) and caller in sites and depth < _DEPTH:
             yield from _calls(analysis, caller, own, depth + 1)
         else:
@@ -59,7 +58,7 @@ def _calls(analysis: Analysis, function: Function, names: Sequence[str], depth: 
 
 
 def _why_other(
-    analysis: Analysis, caller: Function, call: cst.Call, given: Sequence[Meaning], is_drawn: bool
+    analysis: Analysis, caller: Function, call: ast.Call, given: Sequence[Meaning], is_drawn: bool
 ) -> Optional[Evidence]:
     """Return the evidence that a call is not for the loss: by what it is given, or by the step after it."""
     rules = [rule.id for meaning in given for rule in KINDS if rule.kind == meaning.kind]

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import ast
 import builtins
 from typing import List, NamedTuple, Optional, Tuple
-
-import libcst as cst
 
 from legs_adapters.code.calls import values_of
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.parsing import Place
 from legs_adapters.code.reaching import Definition
-from legs_adapters.code.syntax import attribute_chain, call_name, key_of, one_line, same, words, words_in
+from legs_adapters.code.syntax import (
+    attribute_chain,
+    call_name,
+    given,
+    indices,
+    key_of,
+    one_line,
+    same,
+    words,
+    words_in,
+)
 from legs_adapters.lexicon.depiction import parts_of
 from legs_adapters.lexicon.meaning import UNKNOWN, swapped
 from legs_adapters.lexicon.names import is_of_other_framework, kind_of_words
@@ -89,6 +98,7 @@ class Verdicts:
     def decide_callback(self, holder: Function, form: PassedByName) -> Site | Left:
         """Return the verdict on an L1 function that is passed by name, from the arguments of its call."""
         term = Term(self.analysis, form.caller or holder, form)
+        term.here = [(holder, form.node)]
         evidence = first(term)
         if evidence is None and swapped(term.pair.a, term.pair.b) is not False:
             evidence = Evidence("unknown", "unknown", term.here)
@@ -161,33 +171,33 @@ class Verdicts:
         is_told = not self._is_unknown_entry(term.function, term.prediction)
         return "" if is_told else f"nothing shows which pictures {prediction} takes"
 
-    def _unknown_maker(self, function: Function, target: cst.BaseExpression) -> Optional[cst.Call]:
+    def _unknown_maker(self, function: Function, target: ast.expr) -> Optional[ast.Call]:
         """Return what makes a target of a photograph, ``teacher(photo)``, where nothing shows what that does."""
         meaning = self.analysis.meanings.meaning
-        work: List[Tuple[Function, cst.CSTNode]] = [(function, target)]
+        work: List[Tuple[Function, ast.AST]] = [(function, target)]
         for where, node in work:  # which grows
             parts = [*where.flow.assigned(node), *parts_of(node)]
-            returned: List[Tuple[Function, cst.CSTNode]] = []
-            if isinstance(node, cst.Subscript):
+            returned: List[Tuple[Function, ast.AST]] = []
+            if isinstance(node, ast.Subscript):
                 parts = [node.value]
-            elif isinstance(node, cst.Call):
-                given = [arg.value for arg in node.args if not FILES & words_in(arg.value)]
-                if PHOTOGRAPH in [meaning(where, each) for each in given] and self._is_unknown(where, node):
+            elif isinstance(node, ast.Call):
+                handed = [arg.value for arg in given(node) if not FILES & words_in(arg.value)]
+                if PHOTOGRAPH in [meaning(where, each) for each in handed] and self._is_unknown(where, node):
                     return node
                 returned = values_of(self.analysis.program, where, node)
-                parts = [*given, *attribute_chain(node.func)] if call_name(node) in KEEPS_PICTURES else []
-            elif isinstance(node, cst.BinaryOperation):  # photo * segment(photo): a mask
+                parts = [*handed, *attribute_chain(node.func)] if call_name(node) in KEEPS_PICTURES else []
+            elif isinstance(node, ast.BinOp):  # photo * segment(photo): a mask
                 shown = [part for part in parts if meaning(where, part) == PHOTOGRAPH]
-                parts = [part for part in parts if len(shown) < 2 or not isinstance(part, cst.Call)]
+                parts = [part for part in parts if len(shown) < 2 or not isinstance(part, ast.Call)]
             pictures = [(where, part) for part in parts if meaning(where, part).kind in (None, "image")]
             goes_on = where.module.spend(1 + len(parts)) and len(work) < _MOST
             work += [each for each in pictures + returned if each not in work] if goes_on else []
         return None
 
-    def _is_unknown(self, function: Function, call: cst.Call) -> bool:
+    def _is_unknown(self, function: Function, call: ast.Call) -> bool:
         """Return whether a call is of what neither the checkout defines nor a known library of images."""
         root = list(attribute_chain(call.func))[-1]
-        name = root.value if isinstance(root, cst.Name) else ""
+        name = root.id if isinstance(root, ast.Name) else ""
         if call_name(call) in KEEPS_PICTURES or (DATA | {"self"}) & set(words(name)):
             return False  # a camera's own method, or an inherited one
         found = self.analysis.program.resolve(function, call.func)
@@ -196,16 +206,16 @@ class Verdicts:
             return len(libraries) == len(found) and not all(map(OF_IMAGES.match, libraries))
         return name not in MODULES and not hasattr(builtins, name)
 
-    def _is_unknown_entry(self, function: Function, side: cst.CSTNode) -> bool:
+    def _is_unknown_entry(self, function: Function, side: ast.AST) -> bool:
         """Return whether it is under each key in turn, or one in another that no word tells: ``pkg["out"]["D"]``."""
         entry = function.flow.value_of(side) or side
-        if not isinstance(entry, cst.Subscript):
+        if not isinstance(entry, ast.Subscript):
             return False
         named = [kind_of_words(key) for key in map(key_of, attribute_chain(entry)) if isinstance(key, str)]
         if len(named) > 1 and "image" not in named and self.analysis.meanings.meaning(function, entry).kind is None:
             return True
-        index = entry.slice[-1].slice  # package[name] of `for name in package`
-        looped = [made.value for made in function.flow.reaching(index.value)] if isinstance(index, cst.Index) else []
+        last = indices(entry)[-1:]  # package[name] of `for name in package`
+        looped = [made.value for index in last for made in function.flow.reaching(index)]
         holders = [part for value in looped if value is not None for part in attribute_chain(value)]
         return any(same(entry.value, holder) for holder in holders)
 
@@ -213,7 +223,7 @@ class Verdicts:
         """Return what shows that a side is the photograph."""
         name = one_line(term.target)
         if self.analysis.meanings.origin(term.function, term.target).role == "target":
-            is_place = isinstance(term.target, (cst.Name, cst.Attribute, cst.Subscript, cst.Call))
+            is_place = isinstance(term.target, (ast.Name, ast.Attribute, ast.Subscript, ast.Call))
             return f"{name} is {'' if is_place else 'made from '}the photograph"
         where = "a parameter, " if term.function.is_parameter(term.target) else ""
         return f"{name} is {where}the photograph by its name"

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
-from typing import Callable, Dict, List, Optional, Sequence, Set, Tuple
-
-import libcst as cst
+from typing import Dict, List, Optional, Sequence, Set, Tuple
 
 from legs_adapters.code.calls import callees, given_to, handed, sure_calls
 from legs_adapters.code.module import Function
@@ -17,6 +16,8 @@ from legs_adapters.code.syntax import (
     call_name,
     children,
     constant,
+    entries,
+    given,
     key_of,
     path_of,
     walk_expressions,
@@ -25,7 +26,7 @@ from legs_adapters.tensors.operations import APPLIES, BACKWARD, ENDS_GRADIENT, H
 from legs_adapters.tensors.steps import is_backward
 
 TRAINS = re.compile(r"(?:backward|grad(?<!\wgrad))\s*\(")  # a text that runs a backward pass
-_Site = Tuple[Function, cst.Call]  # a call, behind the function that it stands in
+_Site = Tuple[Function, ast.Call]  # a call, behind the function that it stands in
 _ANY = object()
 _DEPTH = 2
 
@@ -33,18 +34,14 @@ _DEPTH = 2
 class Training:
     """The slice of a program that its backward passes depend on.
 
-    Args:
-        matters: a predicate on the text of a function: the slice does not enter functions where it is false.
-
     Attributes:
         roots: the functions that call ``.backward()`` or return what a framework trains on. A call of
             ``torch.autograd.grad`` is one where a parameter gets its result; else it only scores.
         sites: for a function that contributes, the calls (each with its caller) through which it does.
     """
 
-    def __init__(self, program: Program, matters: Callable[[str], bool]) -> None:
+    def __init__(self, program: Program) -> None:
         self.program = program
-        self._matters: Callable[[Function], bool] = lambda function: matters(function.text)
         self.roots: List[Function] = []
         self._sites: Dict[Function, Dict[int, _Site]] = {}
         # By an expression's id the call that alone takes its gradient, to be read; None for what is trained.
@@ -53,7 +50,7 @@ class Training:
         self._touched: Set[Function] = set()
         self._begun: Set[Function] = set()  # those in which the slice begins
         self._done: Set[Tuple[int, object]] = set()
-        self._work: List[Tuple[Function, cst.CSTNode | Reaching, object]] = []
+        self._work: List[Tuple[Function, ast.AST | Reaching, object]] = []
         scoring: List[_Site] = []
         for module in program.matching(TRAINS):
             for function in module.scopes(TRAINS.search):
@@ -70,21 +67,21 @@ class Training:
             self._follow()
         self.sites: Dict[Function, List[_Site]] = {runs: list(calls.values()) for runs, calls in self._sites.items()}
 
-    def _is_applied(self, function: Function, call: Optional[cst.Call], names: Set[str], depth: int = 0) -> bool:
+    def _is_applied(self, function: Function, call: Optional[ast.Call], names: Set[str], depth: int = 0) -> bool:
         """Return whether a parameter steps by a gradient, a call's or one of these names: ``p.grad = g``, ``p -= g``.
 
         It is followed into functions that are given it, callers that get it, and methods of the class that stores it.
         """
 
-        def has(value: cst.CSTNode) -> bool:
+        def has(value: ast.AST) -> bool:
             return depends(function, value, names, call)
 
         made = [(each, each.value) for each in function.flow.every_definition if each.value is not None]
-        given = [value for each, value in made if _is_less(each) or each.place.endswith(".grad")]
-        given += [arg.value for each in function.flow.calls if _is_downhill(each) for arg in each.args]
-        if any(has(value) and not any(map(_loses_sign, attribute_chain(value))) for value in given):
+        steps = [value for each, value in made if _is_less(each) or each.place.endswith(".grad")]
+        steps += [arg.value for each in function.flow.calls if _is_downhill(each) for arg in given(each)]
+        if any(has(value) and not any(map(_loses_sign, attribute_chain(value))) for value in steps):
             return True
-        inner: List[Tuple[Function, Optional[cst.Call], Set[str]]] = []
+        inner: List[Tuple[Function, Optional[ast.Call], Set[str]]] = []
         for each in function.flow.calls if depth < _DEPTH else ():
             for callee in callees(self.program, function, each):
                 taken = [(name, callee.given(each, name)) for name in callee.parameters]
@@ -104,15 +101,15 @@ class Training:
             if function.module.spend(1):
                 self._reach(function, node, key) if isinstance(node, Reaching) else self._visit(function, node, key)
 
-    def scores(self, node: cst.CSTNode) -> Optional[_Site]:
+    def scores(self, node: ast.AST) -> Optional[_Site]:
         """Return the call of ``torch.autograd.grad`` that alone takes the gradient of this expression, to be read."""
         return self._reached.get(id(node))
 
-    def _is_grad(self, function: Function, call: cst.Call) -> bool:
+    def _is_grad(self, function: Function, call: ast.Call) -> bool:
         """Return whether a call is ``torch.autograd.grad(...)``."""
         return call_name(call) == "grad" and any(map(_takes_gradient, self.program.resolve(function, call.func)))
 
-    def includes(self, node: cst.CSTNode) -> bool:
+    def includes(self, node: ast.AST) -> bool:
         """Return whether a backward pass reaches this expression."""
         return self._reached.get(id(node), ()) is None
 
@@ -120,46 +117,48 @@ class Training:
         """Return whether a backward pass reaches an expression of this function."""
         return function in self._touched
 
-    def _begin(self, function: Function, values: Sequence[cst.CSTNode], is_root: bool) -> None:
+    def _begin(self, function: Function, values: Sequence[ast.AST], is_root: bool) -> None:
         if is_root and function not in self.roots:
             self.roots.append(function)
         self._begun.update([function] if values else [])
         for value in values:
             self._push(function, value)
 
-    def _push(self, function: Function, node: Optional[cst.CSTNode | Reaching], key: object = _ANY) -> None:
+    def _push(self, function: Function, node: Optional[ast.AST | Reaching], key: object = _ANY) -> None:
         mark = (id(node), key if isinstance(key, (str, int)) else _ANY)
         if node is not None and mark not in self._done:
             self._done.add(mark)
             self._work.append((function, node, key))
 
-    def _visit(self, function: Function, node: cst.CSTNode, key: object) -> None:
+    def _visit(self, function: Function, node: ast.AST, key: object) -> None:
         """Mark what ``node`` (or, with a key, ``node[key]``) gets its value from."""
         self._touched.add(function)
-        entries = _entries(node, key)
-        for entry in entries:
+        found = _entries(node, key)
+        for entry in found:
             self._push(function, entry)
-        if entries:
+        if found:
             return
         self._reached.setdefault(id(node), self._scoring)
-        if isinstance(node, cst.Call):
+        if isinstance(node, ast.Call):
             self._call(function, node, key)
-        elif isinstance(node, cst.Attribute) and node.attr.value in SIZES:
+        elif isinstance(node, ast.Attribute) and node.attr in SIZES:
             pass
-        elif isinstance(node, (cst.Name, cst.Attribute, cst.Subscript)):
+        elif isinstance(node, (ast.Name, ast.Attribute, ast.Subscript)):
             self._place(function, node, key)
-        elif isinstance(node, (cst.DictComp, cst.CompFor)):
-            for part in (node.value, node.for_in) if isinstance(node, cst.DictComp) else (node.iter, node.inner_for_in):
+        elif isinstance(node, ast.DictComp):
+            for part in (node.value, *node.generators):
                 self._push(function, part)
-        elif isinstance(node, cst.IfExp):
+        elif isinstance(node, ast.comprehension):
+            self._push(function, node.iter)
+        elif isinstance(node, ast.IfExp):
             self._push(function, node.body, key)
             self._push(function, node.orelse, key)
-        elif not isinstance(node, cst.Comparison):
+        elif not isinstance(node, ast.Compare):
             for child in children(node):
                 self._push(function, child)
 
-    def _call(self, function: Function, node: cst.Call, key: object) -> None:
-        name, owner = call_name(node), node.func.value if isinstance(node.func, cst.Attribute) else None
+    def _call(self, function: Function, node: ast.Call, key: object) -> None:
+        name, owner = call_name(node), node.func.value if isinstance(node.func, ast.Attribute) else None
         positional = arguments(node)[0]
         literal = constant(positional[0]) if positional else None
         if owner is not None and name in ENDS_GRADIENT | SIZES | BACKWARD:
@@ -171,31 +170,31 @@ class Training:
         if any(map(_takes_gradient, references)):
             return
         for reference in references:
-            if isinstance(reference.target, cst.Lambda):
+            if isinstance(reference.target, ast.Lambda):
                 self._push(function, reference.target.body)
             for callee in self.program.run_by(reference):
                 self._sites.setdefault(callee, {})[id(node)] = (function, node)
-                for value in callee.flow.returns if self._matters(callee) else ():
+                for value in callee.flow.returns:
                     self._push(callee, value, key)
-        for arg in node.args:
+        for arg in given(node):
             self._push(function, arg.value)
-        if not isinstance(node.func, cst.Name):
+        if not isinstance(node.func, ast.Name):
             self._push(function, owner or node.func)
 
-    def _place(self, function: Function, node: cst.CSTNode, key: object) -> None:
+    def _place(self, function: Function, node: ast.AST, key: object) -> None:
         found = self.program.lookup(function, node)
         if found is not None:
             self._push(*found, key)
-        elif isinstance(node, cst.Subscript):
+        elif isinstance(node, ast.Subscript):
             inner = key_of(node)
             self._push(function, node.value, _ANY if inner is None else inner)
-        elif isinstance(node, cst.Attribute):
+        elif isinstance(node, ast.Attribute):
             owner = self.program.owner_of(function)
-            if not isinstance(node.value, cst.Name) or node.value.value != "self":
-                self._push(function, node.value, "." + node.attr.value)
+            if not isinstance(node.value, ast.Name) or node.value.id != "self":
+                self._push(function, node.value, "." + node.attr)
             elif owner is not None:
                 for one in self.program.lineage(owner):
-                    for where, made in one.stores(node.attr.value, self._matters):
+                    for where, made in one.stores(node.attr):
                         self._push(where, made, key)
 
     def _reach(self, function: Function, definition: Reaching, key: object) -> None:
@@ -205,18 +204,18 @@ class Training:
             return
         value, kind = definition.value, definition.kind
         is_given = kind == "parameter" and definition.place in function.parameters and function in self._begun
-        for caller, given in given_to(self.program, function, definition.place) if is_given else ():
-            self._push(caller, given, key)  # def step(losses): sum(losses.values()).backward()
+        for caller, argument in given_to(self.program, function, definition.place) if is_given else ():
+            self._push(caller, argument, key)  # def step(losses): sum(losses.values()).backward()
         if kind == "store":
             if definition.key in (None, key) or key is _ANY:
                 self._push(function, value)
-        elif isinstance(definition.node, cst.AugAssign):
+        elif isinstance(definition.node, ast.AugAssign):
             self._push(function, definition.node.target, key)
             self._push(function, value)
         elif kind in ("element", "part"):
             self._push(function, value, _ANY if definition.index is None or kind == "part" else definition.index)
-        elif kind in ("mutate", "inplace") and isinstance(value, cst.Call):
-            for arg in value.args:
+        elif kind in ("mutate", "inplace") and isinstance(value, ast.Call):
+            for arg in given(value):
                 self._push(function, arg.value, key if call_name(value) == "update" else _ANY)
         else:
             self._push(function, value, key)
@@ -228,38 +227,38 @@ def _takes_gradient(reference: Reference) -> bool:
 
 def _is_less(made: Definition) -> bool:
     """Return whether a place becomes less: ``p -= rate * g``, ``p = (p - rate * g).detach()``."""
-    parts = [part for part in attribute_chain(made.value or made.node) if isinstance(part, cst.BinaryOperation)]
-    less = any(isinstance(part.operator, cst.Subtract) and path_of(part.left) == made.place for part in parts)
-    return less or isinstance(getattr(made.node, "operator", None), cst.SubtractAssign)
+    parts = [part for part in attribute_chain(made.value or made.node) if isinstance(part, ast.BinOp)]
+    less = any(isinstance(part.op, ast.Sub) and path_of(part.left) == made.place for part in parts)
+    return less or (isinstance(made.node, ast.AugAssign) and isinstance(made.node.op, ast.Sub))
 
 
-def _loses_sign(node: cst.CSTNode) -> bool:
+def _loses_sign(node: ast.AST) -> bool:
     """Return whether it is a size, ``gradient.abs()``: nothing steps by one."""
-    return isinstance(node, cst.Call) and call_name(node) in ("abs", "norm", "square")
+    return isinstance(node, ast.Call) and call_name(node) in ("abs", "norm", "square")
 
 
-def _is_downhill(call: cst.Call) -> bool:
+def _is_downhill(call: ast.Call) -> bool:
     """Return whether a call may step by its arguments: ``p.add_(g, alpha=-rate)``, no sum: ``scores.add_(g.abs())``."""
-    if call_name(call) == "setattr" and len(call.args) == 3:
-        return constant(call.args[1].value) == "grad"
-    is_sum = call_name(call) == "add_" and not any(isinstance(part, cst.Minus) for part in walk_expressions(call))
+    if call_name(call) == "setattr" and len(given(call)) == 3:
+        return constant(given(call)[1].value) == "grad"
+    signs = [part.op for part in walk_expressions(call) if isinstance(part, ast.UnaryOp)]
+    is_sum = call_name(call) == "add_" and not any(isinstance(sign, ast.USub) for sign in signs)
     return call_name(call) in APPLIES and not is_sum
 
 
-def _trained_by(call: cst.Call) -> List[cst.BaseExpression]:
+def _trained_by(call: ast.Call) -> List[ast.expr]:
     """Return the value whose gradients a backward pass takes."""
-    values = [arg.value for arg in call.args if arg.keyword is None or arg.keyword.value in LOSSES]
+    values = [arg.value for arg in given(call) if not arg.keyword or arg.keyword in LOSSES]
     if call_name(call) == "grad":
         return values[:1]
-    return [*values, call.func.value] if isinstance(call.func, cst.Attribute) else values
+    return [*values, call.func.value] if isinstance(call.func, ast.Attribute) else values
 
 
-def _entries(node: cst.CSTNode, key: object) -> Sequence[cst.CSTNode]:
+def _entries(node: ast.AST, key: object) -> Sequence[ast.AST]:
     """Return the entry of a literal tuple, list or dictionary under a key; nothing where it is not known."""
-    if isinstance(node, (cst.Tuple, cst.List)) and isinstance(key, int):
-        return [each.value for each in node.elements][key:][:1] if -len(node.elements) <= key else []
-    if isinstance(node, cst.Dict) and key is not _ANY:
-        literal = [each for each in node.elements if isinstance(each, cst.DictElement)]
-        found = [each.value for each in literal if constant(each.key) == key]
-        return found if len(literal) == len(node.elements) else []
+    if isinstance(node, (ast.Tuple, ast.List)) and isinstance(key, int):
+        return node.elts[key:][:1] if -len(node.elts) <= key else []
+    if isinstance(node, ast.Dict) and key is not _ANY:
+        found = [value for known, value in entries(node) if constant(known) == key]
+        return found if None not in node.keys else []
     return []

@@ -5,10 +5,9 @@ An operation may stand in several lists: ``detach`` moves a value, and ends its 
 
 from __future__ import annotations
 
+import ast
 import re
 from typing import List, Optional, Set
-
-import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.reaching import Reaching
@@ -75,19 +74,19 @@ _MIXES = word_set("addcmul bmm lerp matmul mm where")  # an exposure, a backgrou
 KEEPS_PICTURES = PICTURE_FUNCTIONS | TRANSFORMS | _MIXES
 
 
-def depends(function: Function, node: cst.CSTNode, names: Set[str], call: Optional[cst.Call] = None) -> bool:
+def depends(function: Function, node: ast.AST, names: Set[str], call: Optional[ast.Call] = None) -> bool:
     """Return whether an expression of a function depends on the value of one of these names, or of a call there.
 
     What depends on the size alone does not.
     """
     met: Set[Reaching] = set()
-    work: List[cst.CSTNode] = [node]
+    work: List[ast.AST] = [node]
     while work:
         part = work.pop()
-        if part is call or (isinstance(part, (cst.Name, cst.Attribute)) and path_of(part) in names):
+        if part is call or (isinstance(part, (ast.Name, ast.Attribute)) and path_of(part) in names):
             return True
-        if isinstance(part, (cst.Name, cst.Attribute)):
+        if isinstance(part, (ast.Name, ast.Attribute)):
             work.extend(made.value for made in function.flow.reaching(part).new(met) if made.value is not None)
-        if not (isinstance(part, cst.Attribute) and part.attr.value in SIZES):
+        if not (isinstance(part, ast.Attribute) and part.attr in SIZES):
             work.extend(children(part))
     return False

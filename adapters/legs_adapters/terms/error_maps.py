@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import ast
 import functools
 from typing import Dict, Iterable, List, Optional, Tuple
 
-import libcst as cst
-
 from legs_adapters.code.module import Function
 from legs_adapters.code.reaching import Definition, Reaching
-from legs_adapters.code.syntax import attribute_chain, call_name, walk_expressions
+from legs_adapters.code.syntax import attribute_chain, call_name, given, walk_expressions
 from legs_adapters.lexicon.masks import makes_mask
 from legs_adapters.tensors.backward import Training
 from legs_adapters.tensors.gradients import no_grad_around
 from legs_adapters.tensors.operations import EXTREMES, LEAVES, SIZES, TRANSFORMS
 from legs_adapters.terms.form import Form
 
-_USING = (cst.Attribute, cst.AugAssign, cst.BinaryOperation, cst.Call, cst.Comparison)  # isinstance is slow for others
+_USING = (ast.Attribute, ast.AugAssign, ast.BinOp, ast.Call, ast.Compare)  # isinstance is slow for others
 
 
 class _Uses:
@@ -24,40 +23,41 @@ class _Uses:
 
     def __init__(self, function: Function) -> None:
         function.module.spend(function.flow.steps)
-        unused: List[cst.CSTNode] = []
-        masks: List[cst.CSTNode] = []
-        changed: List[cst.CSTNode] = []  # compared, squared, or scaled: a weight moves the threshold
-        compared: List[cst.CSTNode] = []
-        numbers: List[cst.CSTNode] = []
-        for part in (part for part in walk_expressions(function.body) if type(part) in _USING):
-            if isinstance(part, cst.Comparison):
-                compared += [part.left, *(each.comparator for each in part.comparisons)]
-            elif isinstance(part, cst.BinaryOperation) and isinstance(part.operator, cst.Power):
+        unused: List[ast.AST] = []
+        masks: List[ast.AST] = []
+        changed: List[ast.AST] = []  # compared, squared, or scaled: a weight moves the threshold
+        compared: List[ast.AST] = []
+        numbers: List[ast.AST] = []
+        for part in (part for part in function.walk() if type(part) in _USING):
+            if isinstance(part, ast.Compare):
+                compared += [part.left, *part.comparators]
+            elif isinstance(part, ast.BinOp) and isinstance(part.op, ast.Pow):
                 changed.append(part.left)
-            elif isinstance(part, cst.Attribute) and part.attr.value in SIZES:
+            elif isinstance(part, ast.Attribute) and part.attr in SIZES:
                 unused.append(part.value)
-            elif isinstance(part, cst.Call) and call_name(part) in EXTREMES and not part.args:
+            elif isinstance(part, ast.Call) and call_name(part) in EXTREMES and not given(part):
                 changed += attribute_chain(part.func)
-            elif isinstance(part, cst.Call) and call_name(part) in TRANSFORMS:
+            elif isinstance(part, ast.Call) and call_name(part) in TRANSFORMS:
                 changed += walk_expressions(part)
-            elif isinstance(part, cst.AugAssign):
+            elif isinstance(part, ast.AugAssign):
                 unused += attribute_chain(part.target)
-            elif isinstance(part, cst.Call) and call_name(part) in LEAVES:
+            elif isinstance(part, ast.Call) and call_name(part) in LEAVES:
                 numbers += attribute_chain(part)
-            elif isinstance(part, cst.Call) and makes_mask(part):
-                masks += [node for each in (part.func, *(a.value for a in part.args)) for node in attribute_chain(each)]
+            elif isinstance(part, ast.Call) and makes_mask(part):
+                masks += attribute_chain(part.func)
+                masks += [node for each in given(part) for node in attribute_chain(each.value)]
         self.unused, self.masks = set(map(id, unused + numbers)), set(map(id, masks))
         self.changed, self.numbers = set(map(id, changed + compared)), set(map(id, compared + numbers))
-        self._reads: Dict[str, Dict[Reaching, List[cst.Name]]] = {}  # by the name, and what reaches them
+        self._reads: Dict[str, Dict[Reaching, List[ast.Name]]] = {}  # by the name, and what reaches them
         for read in function.flow.reads:
-            self._reads.setdefault(read.value, {}).setdefault(function.flow.reaching(read), []).append(read)
+            self._reads.setdefault(read.id, {}).setdefault(function.flow.reaching(read), []).append(read)
         self.made: Dict[int, Definition] = {}  # by the id of a value, or of what a value is the mean of over an axis
         for made in function.flow.every_definition:
             if made.kind == "assign":
                 for value in (made.value, *_averaged(made.value)):
                     self.made.setdefault(id(value), made)
 
-    def reads_of(self, made: Definition) -> List[cst.Name]:
+    def reads_of(self, made: Definition) -> List[ast.Name]:
         """Return the reads that a definition reaches."""
         reads = self._reads.get(made.place, {})
         has: Dict[Reaching, bool] = {made: True}
@@ -73,7 +73,7 @@ def _uses(function: Function) -> _Uses:
     return _Uses(function)
 
 
-def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[cst.Name], List[cst.Name]]:
+def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[ast.Name], List[ast.Name]]:
     """Return the reads of a named error map, logging and sizes aside; none where the map has no name of its own.
 
     Returns:
@@ -92,11 +92,11 @@ def reads_of(training: Training, function: Function, form: Form) -> Tuple[List[c
     return loss, reads if is_changed else others
 
 
-def _averaged(value: Optional[cst.CSTNode]) -> Iterable[cst.CSTNode]:
+def _averaged(value: Optional[ast.AST]) -> Iterable[ast.AST]:
     """Return what a value is the mean of over an axis."""
-    if not isinstance(value, cst.Call) or call_name(value) != "mean":
+    if not isinstance(value, ast.Call) or call_name(value) != "mean":
         return ()
-    return (*attribute_chain(value.func), *(arg.value for arg in value.args))
+    return (*attribute_chain(value.func), *(arg.value for arg in given(value)))
 
 
 def is_measured(function: Function, form: Form) -> bool:

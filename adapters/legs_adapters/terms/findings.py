@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
+import ast
 from typing import TYPE_CHECKING, Any, Container, Dict, FrozenSet, Iterator, List, NamedTuple, Optional, Sequence, Tuple
-
-import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.parsing import Place
@@ -18,7 +16,7 @@ from legs_adapters.terms.writing import Writing
 if TYPE_CHECKING:
     from legs_adapters.terms.traced import Trace
 
-Decider = Tuple[Function, cst.CSTNode]
+Decider = Tuple[Function, ast.AST]
 
 
 class Line(NamedTuple):
@@ -64,11 +62,9 @@ class Left(NamedTuple):
 
 def _lines(deciders: Sequence[Decider]) -> Iterator[Line]:
     for function, node in deciders:
-        if not isinstance(node, cst.Module):  # a whole file has no deciding line
-            # Nor has a node that the analysis made, or one of a file that LibCST writes differently.
-            with contextlib.suppress(KeyError, ValueError):
-                line = function.place(node).line
-                yield Line(function.module.path, line, function.module.lines.text(line))
+        if hasattr(node, "lineno"):  # a whole file has no deciding line, nor has a node that the analysis made
+            line = function.place(node).line
+            yield Line(function.module.path, line, function.module.lines.text(line))
 
 
 class Use(NamedTuple):
@@ -81,7 +77,7 @@ class Use(NamedTuple):
     """
 
     caller: Function
-    call: cst.Call
+    call: ast.Call
     other: Optional[Evidence]
     is_known: bool
 

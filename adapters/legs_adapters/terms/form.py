@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 from dataclasses import dataclass
 from typing import ClassVar, List, Optional, Tuple
 
-import libcst as cst
-
+from legs_adapters.code.syntax import Arg
 from legs_adapters.terms.text import Edit, Text, apply_edits, on_one_line
 from legs_adapters.terms.writing import Writing
 
@@ -27,12 +27,12 @@ class Form:
         done: what the edit does to it, in words.
     """
 
-    node: cst.BaseExpression
-    call: cst.Call
-    first: cst.BaseExpression
-    second: cst.BaseExpression
-    callee: Optional[cst.BaseExpression] = None
-    extras: Tuple[cst.Arg, ...] = ()
+    node: ast.expr
+    call: ast.Call
+    first: ast.expr
+    second: ast.expr
+    callee: Optional[ast.expr] = None
+    extras: Tuple[Arg, ...] = ()
     makes: str = "own"
 
     term: ClassVar[str] = ""

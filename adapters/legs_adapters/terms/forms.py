@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import ast
 from typing import List, Set, Tuple, Type, Union
-
-import libcst as cst
 
 from legs_adapters.code.limits import remembered
 from legs_adapters.code.module import Function
@@ -45,11 +44,11 @@ def _transformed(function: Function) -> Set[int]:
     """Return the ids of the calls whose values are squared or transformed (log, exp): they are not an L1."""
     found: Set[int] = set()
     for node in function.flow.expressions:
-        parts: List[cst.CSTNode] = []
-        if isinstance(node, cst.BinaryOperation) and isinstance(node.operator, cst.Power):
+        parts: List[ast.AST] = []
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
             parts = [node.left]
-        elif isinstance(node, cst.Call) and call_name(node) in TRANSFORMS:
-            parts = [node.func, *node.args]
+        elif isinstance(node, ast.Call) and call_name(node) in TRANSFORMS:
+            parts = [node.func, *node.args, *node.keywords]
         for part in parts:
-            found.update(id(n) for n in walk_expressions(part) if isinstance(n, cst.Call) and n is not node)
+            found.update(id(n) for n in walk_expressions(part) if isinstance(n, ast.Call) and n is not node)
     return found

@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from typing import Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
-
-import libcst as cst
 
 from legs_adapters.code.module import CALLED, Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.returned import returned
 from legs_adapters.code.syntax import (
     arguments,
-    attribute_chain,
     call_name,
     code,
     constant,
     dotted,
+    given,
     key_of,
+    name_of,
     walk_expressions,
 )
 from legs_adapters.lexicon.names import TORCH_L1, has_perceptual_name, is_l1_name
 from legs_adapters.lexicon.words import SPEAKS_OF_LOSS
 from legs_adapters.tensors.absolute import abs_argument, absolute_value, sides_of
 from legs_adapters.tensors.operations import ASKS, LIKE, LIMITS, OTHER_LOSSES, SIZES, TRANSFORMS, TRANSPARENT, depends
-from legs_adapters.terms.prospects import Prospects
 from legs_adapters.terms.writing import PACKAGE
 
 _DEPTH = 4
-_AS_MAP = (["reduction='none'"], ['reduction="none"'])
 
 
 class _Body(NamedTuple):
@@ -42,7 +40,7 @@ class _Body(NamedTuple):
     pairs: Sequence[Tuple[str, str]]
     depth: int
 
-    def is_pair(self, left: cst.CSTNode, right: cst.CSTNode) -> bool:
+    def is_pair(self, left: ast.AST, right: ast.AST) -> bool:
         """Return whether two expressions are the same of the one and of the other."""
         return any(_are_mirrored(left, right, *pair) for pair in self.pairs)
 
@@ -52,21 +50,11 @@ class L1Functions:
 
     Args:
         program: the program.
-        prospects: which text can lead to an L1 at all.
     """
 
-    def __init__(self, program: Program, prospects: Prospects) -> None:
+    def __init__(self, program: Program) -> None:
         self.program = program
-        self._prospects = prospects
         self._only: Dict[Function, bool] = {}
-
-    def may_be_called(self, function: Function, node: cst.CSTNode) -> bool:
-        """Return whether an expression may be an L1 function, a variable or by its words: resolving it costs more."""
-        if self._prospects.may_have(dotted(node) or code(node)):
-            return True
-        found = self.program.lookup(function, list(attribute_chain(node))[-1])
-        values = [made.value for made in (found[1] if found else ()) if made.kind in ("assign", "element", "with")]
-        return any(value is not None and self._prospects.may_hold(code(value)) for value in values)
 
     def shape(self, function: Function, depth: int = 0) -> Optional[str]:
         """Return what a function of the checkout, so many calls deep, computes from its first two arguments.
@@ -75,7 +63,7 @@ class L1Functions:
             "mean" for ``abs(a - b).mean()``, "none" for ``abs(a - b)``, "own" for any other L1 that depends on
             the difference (and on further arguments) only; None where it is not an L1.
         """
-        if len(function.parameters) < 2 or depth > _DEPTH or not self._prospects.may_have(function.text):
+        if len(function.parameters) < 2 or depth > _DEPTH:
             return None
         if function not in self._only:
             self._only[function] = False  # for recursion
@@ -85,21 +73,22 @@ class L1Functions:
         if set(function.decorators) - TRANSPARENT:
             return "own"  # the decorator may change what is returned: a mean, a weight
         value = returned(function)
-        shape = self._shape_of(function, value, depth) if isinstance(value, cst.Call) else None
+        shape = self._shape_of(function, value, depth) if isinstance(value, ast.Call) else None
         return shape or ("own" if SPEAKS_OF_LOSS.search(function.name) or function.name in CALLED else None)
 
-    def _shape_of(self, function: Function, node: cst.Call, depth: int) -> Optional[str]:
+    def _shape_of(self, function: Function, node: ast.Call, depth: int) -> Optional[str]:
         """Return what a returned call makes of the two: "mean" or "none", None for anything else."""
         pair, found = function.parameters[:2], absolute_value(node)
         sides = sides_of(found.argument) if found is not None else None
         if found is not None and sides is not None:
             return found.makes if {code(side).strip("() ") for side in sides} == set(pair) else None
         references = self.program.resolve(function, node.func)
-        if [code(arg.value) for arg in node.args[:2]] != pair or len(references) != 1:
+        if [code(arg.value) for arg in given(node)[:2]] != pair or len(references) != 1:
             return None
         if TORCH_L1.search(str(references[0].target)):
-            return "none" if [code(arg).replace(" ", "") for arg in node.args[2:]] in _AS_MAP else None
-        shape = self.shape_of_reference(references[0], depth + 1) if len(node.args) == 2 else None
+            settings = [(arg.keyword, constant(arg.value)) for arg in given(node)[2:]]
+            return "none" if settings == [("reduction", "none")] else None
+        shape = self.shape_of_reference(references[0], depth + 1) if len(given(node)) == 2 else None
         return shape if shape != "own" else None
 
     def shape_of_reference(self, reference: Reference, depth: int = 0) -> Optional[str]:
@@ -126,7 +115,7 @@ class L1Functions:
 
     def _compares_only(self, function: Function, depth: int) -> bool:
         """Return whether a function takes an L1 of its first two parameters, and does nothing else with them."""
-        nodes = [node for statement in function.body.body for node in walk_expressions(statement)]
+        nodes = [node for statement in function.body for node in walk_expressions(statement)]
         pairs, selecting = _selected(function, nodes)
         body, allowed = _Body(function, pairs, depth), set(selecting)
         for node in nodes:
@@ -134,53 +123,53 @@ class L1Functions:
             if parts is None:
                 return False
             allowed.update(id(part) for each in parts for part in walk_expressions(each))
-        if any(isinstance(value, cst.Tuple) for value in function.flow.returns):
+        if any(isinstance(value, ast.Tuple) for value in function.flow.returns):
             return False  # return loss, mask
         compared = {name for pair in pairs for name in pair}
-        names = [node for node in nodes if isinstance(node, cst.Name) and node.value in compared]
-        absolute = any(isinstance(node, cst.Call) and (abs_argument(node) or self._is_l1(body, node)) for node in nodes)
+        names = [node for node in nodes if name_of(node) in compared]
+        absolute = any(isinstance(node, ast.Call) and (abs_argument(node) or self._is_l1(body, node)) for node in nodes)
         return absolute and bool(names) and all(id(node) in allowed for node in names)
 
-    def _may_have(self, body: _Body, node: cst.CSTNode) -> Optional[Sequence[cst.CSTNode]]:
+    def _may_have(self, body: _Body, node: ast.AST) -> Optional[Sequence[ast.AST]]:
         """Return the parts of a node in which it may have the two; None where the function is no L1."""
         sides = sides_of(node)
         if sides is not None and body.is_pair(*sides):
             return self._in_difference(body, node, sides[0])
-        if isinstance(node, cst.BinaryOperation):
+        if isinstance(node, ast.BinOp):
             return self._in_operation(body, node)
-        if isinstance(node, cst.Call):
+        if isinstance(node, ast.Call):
             return self._in_call(body, node)
-        if isinstance(node, cst.Attribute) and node.attr.value in SIZES:
+        if isinstance(node, ast.Attribute) and node.attr in SIZES:
             return [node.value]
-        if isinstance(node, cst.Comparison) and all(depends(body.function, node, {name}) for name in body.pairs[0]):
+        if isinstance(node, ast.Compare) and all(depends(body.function, node, {name}) for name in body.pairs[0]):
             return None  # a threshold of the difference: a weight would move pixels over it
-        if isinstance(node, cst.Subscript) and dotted(node.value) in body.pairs[0] and isinstance(key_of(node), str):
+        if isinstance(node, ast.Subscript) and dotted(node.value) in body.pairs[0] and isinstance(key_of(node), str):
             return None  # an entry of a dictionary: its parameter is no picture itself
         return []
 
-    def _in_difference(self, body: _Body, node: cst.CSTNode, side: cst.CSTNode) -> Optional[List[cst.CSTNode]]:
-        calls = [part for part in walk_expressions(side) if isinstance(part, cst.Call)]
+    def _in_difference(self, body: _Body, node: ast.AST, side: ast.AST) -> Optional[List[ast.AST]]:
+        calls = [part for part in walk_expressions(side) if isinstance(part, ast.Call)]
         if LIMITS & set(map(call_name, calls)):
             return None  # a weighted difference would be cut off
         made = [r for call in calls for r in self.program.resolve(body.function, call.func)]
         return None if any(r.kind == "function" for r in made) else [node]  # edges(a) - edges(b)
 
-    def _in_operation(self, body: _Body, node: cst.BinaryOperation) -> Optional[List[cst.CSTNode]]:
-        if isinstance(node.operator, cst.Power) and depends(body.function, node.left, set(body.pairs[0])):
+    def _in_operation(self, body: _Body, node: ast.BinOp) -> Optional[List[ast.AST]]:
+        if isinstance(node.op, ast.Pow) and depends(body.function, node.left, set(body.pairs[0])):
             return None
-        return [node] if isinstance(node.operator, cst.Multiply) and constant(node.right, 1) == 0 else []
+        return [node] if isinstance(node.op, ast.Mult) and constant(node.right, 1) == 0 else []
 
-    def _in_call(self, body: _Body, node: cst.Call) -> Optional[List[cst.CSTNode]]:
+    def _in_call(self, body: _Body, node: ast.Call) -> Optional[List[ast.AST]]:
         if call_name(node) in TRANSFORMS | OTHER_LOSSES:
             return None
         if call_name(node) in ASKS | LIKE:
-            return list(node.args)
-        return list(node.args[:2]) if self._is_l1(body, node) else []
+            return [*node.args, *node.keywords]
+        return [*node.args[:2]] if self._is_l1(body, node) else []
 
-    def _is_l1(self, body: _Body, node: cst.Call) -> bool:
+    def _is_l1(self, body: _Body, node: ast.Call) -> bool:
         """Return whether a call is of an L1 with both, torch's or the codebase's own."""
         positional = arguments(node)[0]
-        spread = any(arg.star == "*" for arg in node.args)
+        spread = any(isinstance(arg, ast.Starred) for arg in node.args)
         if len(positional) < 2 or spread or not body.is_pair(*positional[:2]):
             return False
         references = self.program.resolve(body.function, node.func)
@@ -189,7 +178,7 @@ class L1Functions:
         return any(self.shape_of_reference(reference, body.depth + 1) for reference in known)
 
 
-def _selected(function: Function, nodes: Sequence[cst.CSTNode]) -> Tuple[List[Tuple[str, str]], Set[int]]:
+def _selected(function: Function, nodes: Sequence[ast.AST]) -> Tuple[List[Tuple[str, str]], Set[int]]:
     """Return the two parameters and equal selections of both, ``x = a[:, mask]``, ``y = b[:, mask]``.
 
     Returns:
@@ -197,19 +186,19 @@ def _selected(function: Function, nodes: Sequence[cst.CSTNode]) -> Tuple[List[Tu
     """
     a, b = function.parameters[:2]
     pairs, selecting = [(a, b)], set()
-    assigned = [(node, node.targets[0].target) for node in nodes if isinstance(node, cst.Assign)]
+    assigned = [(node, node.targets[0]) for node in nodes if isinstance(node, ast.Assign)]
     for (first, one), (second, other) in zip(assigned, assigned[1:]):
-        if not (isinstance(one, cst.Name) and isinstance(other, cst.Name)):
+        if not (isinstance(one, ast.Name) and isinstance(other, ast.Name)):
             continue
-        is_new = all(len(function.flow.definitions.get(name.value, ())) == 1 for name in (one, other))
-        is_new = is_new and isinstance(first.value, cst.Subscript)
-        if (is_new or {one.value, other.value} == {a, b}) and _are_mirrored(first.value, second.value, a, b):
-            pairs.append((one.value, other.value))
+        is_new = all(len(function.flow.definitions.get(name.id, ())) == 1 for name in (one, other))
+        is_new = is_new and isinstance(first.value, ast.Subscript)
+        if (is_new or {one.id, other.id} == {a, b}) and _are_mirrored(first.value, second.value, a, b):
+            pairs.append((one.id, other.id))
             selecting |= {id(part) for node in (first, second) for part in walk_expressions(node)}
     return pairs, selecting
 
 
-def _are_mirrored(left: cst.CSTNode, right: cst.CSTNode, a: str, b: str) -> bool:
+def _are_mirrored(left: ast.AST, right: ast.AST, a: str, b: str) -> bool:
     """Return whether two expressions are equal except for ``a`` in one and ``b`` in the other; not ``self.net(a)``."""
     either = re.compile(rf"\b({re.escape(a)}|{re.escape(b)})\b")
     texts = [re.sub(r"\s+", "", code(node)).strip("()") for node in (left, right)]

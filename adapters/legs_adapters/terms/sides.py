@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from typing import List, NamedTuple, Sequence
 
-import libcst as cst
-
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import attribute_chain, call_name, code, constant, key_of, same, walk_expressions, words
+from legs_adapters.code.syntax import (
+    attribute_chain,
+    call_name,
+    code,
+    given,
+    indices,
+    key_of,
+    name_of,
+    same,
+    walk_expressions,
+    words,
+)
 from legs_adapters.lexicon.depiction import Meanings
 from legs_adapters.lexicon.masks import is_mask
 from legs_adapters.lexicon.meaning import Meaning
@@ -18,6 +28,7 @@ from legs_adapters.lexicon.words import OF_RAYS, STRUCTURAL
 from legs_adapters.tensors.absolute import is_no_picture
 from legs_adapters.tensors.operations import MODULES
 from legs_adapters.terms.form import Form
+from legs_adapters.terms.text import written
 
 
 class Pair(NamedTuple):
@@ -30,15 +41,15 @@ class Pair(NamedTuple):
         is_proven: the way of each shows a rendering and a photograph, whatever the names are.
     """
 
-    first: cst.BaseExpression
-    second: cst.BaseExpression
+    first: ast.expr
+    second: ast.expr
     selection: str
     a: Meaning
     b: Meaning
     is_proven: bool = False
 
 
-def surest(meanings: Meanings, ways: Ways, function: Function, sides: Sequence[cst.CSTNode]) -> Meanings:
+def surest(meanings: Meanings, ways: Ways, function: Function, sides: Sequence[ast.AST]) -> Meanings:
     """Return what answers for the sides of a term: their ways, where these prove both; else their names, too."""
     return ways if {ways.meaning(function, side) for side in sides} == {RENDERING, PHOTOGRAPH} else meanings
 
@@ -46,10 +57,10 @@ def surest(meanings: Meanings, ways: Ways, function: Function, sides: Sequence[c
 def pair_of(meanings: Meanings, ways: Ways, function: Function, form: Form) -> Pair:
     """Return the two sides of a form, with their meanings."""
     first, second, selection = form.first, form.second, ""
-    if isinstance(first, cst.Subscript) and isinstance(second, cst.Subscript):
-        inner = [code(node)[len(code(node.value)) :] for node in (first, second)]
+    if isinstance(first, ast.Subscript) and isinstance(second, ast.Subscript):
+        inner = [written(node)[len(written(node.value)) :] for node in (first, second)]
         squeezed = [re.sub(r"\s+", "", text) for text in inner]
-        if squeezed[0] == squeezed[1] and any(is_mask(meanings, function, element) for element in first.slice):
+        if squeezed[0] == squeezed[1] and any(is_mask(meanings, function, index) for index in indices(first)):
             # the weight map needs the whole image
             first, second, selection = first.value, second.value, inner[0].strip()
     sides = _without_shared_factors(first, second)
@@ -58,11 +69,11 @@ def pair_of(meanings: Meanings, ways: Ways, function: Function, form: Form) -> P
     return Pair(first, second, selection, a, b, answers is ways)
 
 
-def _without_shared_factors(first: cst.BaseExpression, second: cst.BaseExpression) -> List[cst.BaseExpression]:
+def _without_shared_factors(first: ast.expr, second: ast.expr) -> List[ast.expr]:
     """Return ``image`` and ``gt`` of ``image * (1 - mask)`` and ``gt * (1 - mask)``."""
-    if not (isinstance(first, cst.BinaryOperation) and isinstance(second, cst.BinaryOperation)):
+    if not (isinstance(first, ast.BinOp) and isinstance(second, ast.BinOp)):
         return [first, second]
-    if not (isinstance(first.operator, cst.Multiply) and isinstance(second.operator, cst.Multiply)):
+    if not (isinstance(first.op, ast.Mult) and isinstance(second.op, ast.Mult)):
         return [first, second]
     for one, factor in ((first.left, first.right), (first.right, first.left)):
         for other, again in ((second.left, second.right), (second.right, second.left)):
@@ -74,16 +85,16 @@ def _without_shared_factors(first: cst.BaseExpression, second: cst.BaseExpressio
 def same_root(form: Form) -> bool:
     """Return whether an image is compared with itself: ``x[1:] - x[:-1]``."""
     a, b = form.first, form.second
-    if not (isinstance(a, cst.Subscript) and isinstance(b, cst.Subscript)) or isinstance(key_of(a), str):
+    if not (isinstance(a, ast.Subscript) and isinstance(b, ast.Subscript)) or isinstance(key_of(a), str):
         return False
     return same(a.value, b.value) and not same(a, b)
 
 
-def is_of_numbers(function: Function, side: cst.CSTNode) -> bool:
+def is_of_numbers(function: Function, side: ast.AST) -> bool:
     """Return whether a side is a tensor of numbers alone: ``torch.eye(3)``, ``torch.tensor([0.0, 1.0])[:, None]``."""
     value = function.flow.value_of(side) or side
-    read = {part.value for part in function.flow.reads_in(value)}
-    makes = any(isinstance(part, cst.Call) and call_name(part) in ("eye", "tensor") for part in walk_expressions(value))
+    read = {part.id for part in function.flow.reads_in(value)}
+    makes = any(isinstance(part, ast.Call) and call_name(part) in ("eye", "tensor") for part in walk_expressions(value))
     return is_no_picture(value) or (makes and read <= MODULES | {"None", "device"})
 
 
@@ -92,21 +103,23 @@ def of_rays(form: Form) -> bool:
     return any(OF_RAYS.search(code(node)) for node in (form.first, form.second))
 
 
-def is_beside_ssim(function: Function, first: cst.CSTNode, second: cst.CSTNode) -> bool:
+def is_beside_ssim(function: Function, first: ast.AST, second: ast.AST) -> bool:
     """Return whether an SSIM is given the same two, perhaps with another axis: they are images by any name."""
     calls = [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
-    given = [[part for arg in call.args for part in attribute_chain(arg.value)] for call in calls]
-    goes_on = function.module.spend(len(function.flow.calls) + sum(map(len, given)))
-    return goes_on and any(all(any(same(part, side) for part in parts) for side in (first, second)) for parts in given)
+    read = [[part for arg in given(call) for part in attribute_chain(arg.value)] for call in calls]
+    goes_on = function.module.spend(len(function.flow.calls) + sum(map(len, read)))
+    return goes_on and any(all(any(same(part, side) for part in parts) for side in (first, second)) for parts in read)
 
 
-def is_role(node: cst.CSTNode) -> bool:
+def is_role(node: ast.AST) -> bool:
     """Return whether a name is only a role in the loss: ``pred``, ``target``."""
-    return isinstance(node, cst.Name) and all(role_of_words(word) is not None for word in words(node.value))
+    return isinstance(node, ast.Name) and all(role_of_words(word) is not None for word in words(node.id))
 
 
-def speaks_of_images(node: cst.CSTNode) -> bool:
+def speaks_of_images(node: ast.AST) -> bool:
     """Return whether a name in it is about images."""
-    parts = [part for part in walk_expressions(node) if isinstance(part, (cst.Name, cst.SimpleString))]
-    names = [str(part.value if isinstance(part, cst.Name) else constant(part)) for part in parts]
+    parts = list(walk_expressions(node))
+    formatted = {id(value) for part in parts if isinstance(part, ast.JoinedStr) for value in part.values}
+    strings = [part for part in parts if isinstance(part, ast.Constant) and id(part) not in formatted]
+    names = [part.value for part in strings if isinstance(part.value, str)] + list(filter(None, map(name_of, parts)))
     return "image" in map(kind_of_words, names)

@@ -7,6 +7,7 @@ imported make no difference.
 
 from __future__ import annotations
 
+import ast
 import builtins
 import hashlib
 import io
@@ -14,11 +15,9 @@ import keyword
 import tokenize
 from typing import Dict, List, Optional
 
-import libcst as cst
-
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import constant, every_parameter
+from legs_adapters.code.syntax import FUNCTIONS, constant, every_parameter
 from legs_adapters.terms.form import Form
 
 # The hash of a form, and a repository that has it. Each was evaluated on small images of several shapes:
@@ -42,15 +41,15 @@ def proven_ssim(program: Program, function: Function, form: Form) -> Optional[Fu
     """Return the function of a call, where it is 3DGS's SSIM and the further arguments are its defaults."""
     assert form.callee is not None
     target = _called(program, function, form.callee)
-    if target is None or not isinstance(target.node, cst.FunctionDef):
+    if target is None or not isinstance(target.node, FUNCTIONS):
         return None
-    others = list(every_parameter(target.node.params))[2:]
-    given = [(target.given(form.call, other.name.value), other.default) for other in others]
+    others = list(every_parameter(target.node.args))[2:]
+    given = [(target.given(form.call, other.arg), default) for other, default in others]
     is_proven = all(value is None or _are_equal(value, default) for value, default in given)
     return target if is_proven and len(target.parameters) >= 2 and form_of(program, target) in FORMS else None
 
 
-def _are_equal(value: cst.BaseExpression, default: Optional[cst.BaseExpression]) -> bool:
+def _are_equal(value: ast.expr, default: Optional[ast.expr]) -> bool:
     """Return whether an argument is the literal that its parameter has as its default."""
     first, second = constant(value, _NO_LITERAL), constant(default, _NO_LITERAL)
     return first is not _NO_LITERAL and (type(first), first) == (type(second), second)
@@ -71,18 +70,15 @@ def form_of(program: Program, function: Function) -> Optional[str]:
 def _form(program: Program, function: Function, functions: List[Function]) -> Optional[str]:
     """Return the words of one function; add those of the checkout that it calls."""
     node = function.node
-    if not isinstance(node, cst.FunctionDef) or function.owner is not None or function.decorators:
+    if not isinstance(node, FUNCTIONS) or function.owner is not None or function.decorators:
         return None
-    with_keywords = [call.func for call in function.flow.calls if any(arg.keyword for arg in call.args)]
+    with_keywords = [call.func for call in function.flow.calls if any(each.arg for each in call.keywords)]
     if any(_called(program, function, called) for called in with_keywords):
         return None  # a keyword is a name of the other function's
-    node = node.with_changes(body=function.body, leading_lines=())
-    if node.get_docstring(clean=False) is not None:
-        node = node.with_changes(body=function.body.with_changes(body=function.body.body[1:]))
     words: List[str] = []
     local: List[str] = []  # in the order of appearance
-    text = cst.Module(body=[node]).code
-    tokens = [t for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type not in _LEFT_OUT]
+    text = io.StringIO(_text(function))
+    tokens = [token for token in tokenize.generate_tokens(text.readline) if token.type not in _LEFT_OUT]
     for before, token, after in zip([tokens[-1], *tokens], tokens, [*tokens[1:], tokens[-1]]):
         word = token.string
         is_header = "NEWLINE" not in words
@@ -102,9 +98,19 @@ def _form(program: Program, function: Function, functions: List[Function]) -> Op
     return " ".join(words)
 
 
+def _text(function: Function) -> str:
+    """Return the text of a function, without its docstring."""
+    data, place = function.module.lines.data, function.place(function.node)
+    doc, *rest = function.body
+    at, begin = function.place(doc).start, function.place(rest[0]).start if rest else place.end
+    if not isinstance(doc, ast.Expr) or not isinstance(constant(doc.value), str):
+        begin = at
+    return (data[place.start : at] + (data[begin : place.end] or b"pass") + b"\n").decode("utf-8")
+
+
 def _global(program: Program, function: Function, name: str, functions: List[Function]) -> Optional[str]:
     """Return what a name that is not local stands for: a function of the checkout its number, a library's its path."""
-    node = cst.Name(name)
+    node = ast.Name(name, ast.Load())
     called = _called(program, function, node)
     if called is not None:
         functions += [] if called in functions else [called]
@@ -116,7 +122,7 @@ def _global(program: Program, function: Function, name: str, functions: List[Fun
     return name if is_builtin else None
 
 
-def _called(program: Program, function: Function, node: cst.CSTNode) -> Optional[Function]:
+def _called(program: Program, function: Function, node: ast.AST) -> Optional[Function]:
     """Return the one function of the checkout that a name refers to."""
     references = program.resolve(function, node)
     target = references[0].target if len(references) == 1 else None

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import re
-from typing import NamedTuple, Sequence, Tuple
-
-import libcst as cst
+from typing import Any, NamedTuple, Sequence, Tuple
 
 from legs_adapters.code.limits import STRING
 from legs_adapters.code.module import Function, Module
 from legs_adapters.code.sources import Source
-from legs_adapters.code.syntax import code
+from legs_adapters.code.syntax import Arg, code, given
 
 _GAP = re.compile(rf"({STRING})|(?:\s|\\(?=[\r\n])|#[^\r\n]*)+", re.S)  # no comment begins in a string
 _COMMENT_OR_BREAK = re.compile(rf"({STRING})|((?:(?<![ \t])[ \t]+)?#[^\r\n]*|\\?(?:\r\n|\r|\n)[ \t]*)", re.S)
@@ -44,7 +43,7 @@ class Text:
         self.bytes: bytes = self.module.lines.data
         self._shift = len(source.data) - len(self.bytes)  # a byte order mark
 
-    def span(self, node: cst.CSTNode, brackets: bool = False) -> Tuple[int, int]:
+    def span(self, node: ast.AST, brackets: bool = False) -> Tuple[int, int]:
         """Return where a node begins and ends, on request with the brackets around it."""
         place = self.function.place(node, brackets)
         return place.start, place.end
@@ -53,19 +52,30 @@ class Text:
         """Return the text of a span of bytes."""
         return self.bytes[start:end].decode("utf-8")
 
-    def written(self, node: cst.CSTNode) -> str:
-        """Return a node as written, with the brackets around it."""
-        return self.between(*self.span(node, True))
+    def argument_span(self, call: ast.Call, at: int) -> Tuple[int, int]:
+        """Return where an argument of a call begins and ends, its keyword or stars included."""
+        value, keyword, star = given(call)[at]
+        start, end = self.span(value, True)
+        return self.module.lines.before(start, 2 if keyword else len(star) > 0), end
 
     def replace(self, start: int, end: int, after: str) -> Edit:
         """Return the edit that replaces a span of bytes by a text."""
         return Edit(start + self._shift, end + self._shift, after.encode("utf-8"))
 
-    def argument(self, node: cst.BaseExpression, index: str) -> str:
+    def argument(self, node: ast.expr, index: str) -> str:
         """Return an image as written, without the index that it carries."""
-        if not index or not isinstance(node, cst.Subscript):
-            return self.written(node)
-        return self.written(node.value) + residue(self.between(self.span(node.value, True)[1], self.span(node)[1]))
+        if not index or not isinstance(node, ast.Subscript):
+            return written(node)
+        return written(node.value) + residue(self.between(self.span(node.value, True)[1], self.span(node)[1]))
+
+
+def written(node: Any) -> str:
+    """Return a node as written, with the brackets around it; of a name that was made here, that name."""
+    lines = getattr(node, "source", None)
+    if lines is None:
+        return code(node)
+    place = lines.place(node, True)
+    return str(lines.data[place.start : place.end].decode("utf-8"))
 
 
 def names_for_two(text: str) -> Tuple[str, str]:
@@ -75,10 +85,10 @@ def names_for_two(text: str) -> Tuple[str, str]:
     return next((pair for pair in pairs if not used & set(pair)), ("_prediction", "_target"))
 
 
-def flat(arg: cst.Arg) -> str:
+def flat(arg: Arg) -> str:
     """Return an argument on one line, with its keyword or stars."""
-    value = on_one_line(code(arg.value))
-    return f"{arg.keyword.value}={value}" if arg.keyword is not None else f"{arg.star}{value}"
+    value = on_one_line(written(arg.value))
+    return f"{arg.keyword}={value}" if arg.keyword else f"{arg.star}{value}"
 
 
 def on_one_line(text: str) -> str:

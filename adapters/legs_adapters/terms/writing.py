@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 from typing import NamedTuple, Sequence, Tuple
 
-import libcst as cst
-
-from legs_adapters.code.syntax import code
-from legs_adapters.terms.text import flat, names_for_two, on_one_line
+from legs_adapters.code.syntax import Arg
+from legs_adapters.terms.text import flat, names_for_two, on_one_line, written
 
 PACKAGE = "legs_loss"
 
@@ -38,9 +37,9 @@ class Writing(NamedTuple):
         """
         return (', reduction="none"' if as_map else "") + (f", own={own}" if own else "")
 
-    def own(self, callee: cst.BaseExpression, extras: Sequence[cst.Arg]) -> str:
+    def own(self, callee: ast.expr, extras: Sequence[Arg]) -> str:
         """Return the codebase's own function of (prediction, target), with its further arguments."""
-        name = on_one_line(code(callee))
+        name = on_one_line(written(callee))
         if not extras and not self.selection and not self.swapped:
             return name
         others = ", ".join(flat(arg) for arg in extras)

@@ -36,7 +36,6 @@ from legs_loss.spec import WeightSpec
 from tests.lab.experiments.miniature import write_miniature
 from tests.patcher.support import files
 
-pytest.importorskip("libcst")
 pytest.importorskip("numba")
 
 # Profiles

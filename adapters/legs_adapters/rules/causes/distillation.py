@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import ast
 from typing import TYPE_CHECKING, List
-
-import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.rules.rule import Rule, Term, source_of
@@ -36,7 +35,7 @@ class Distillation(Rule):
         return not any(map(is_detached, term.sides))
 
 
-def is_rendered(analysis: Analysis, function: Function, target: cst.CSTNode) -> bool:
+def is_rendered(analysis: Analysis, function: Function, target: ast.AST) -> bool:
     """Return whether what is assigned to a target is a rendering, whatever its name."""
     origin, way = analysis.meanings.origin(function, target), analysis.ways.meaning(function, target)
     return "render" in (origin.role, way.role)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import ast
 from typing import List
-
-import libcst as cst
 
 from legs_adapters.lexicon.names import kind_of_words
 from legs_adapters.rules.rule import Rule, Term, source_of
@@ -45,10 +44,10 @@ class OtherKind(Rule):
                 return self._shown(term, side) if meaning.kind == self.kind else []
         return []
 
-    def _shown(self, term: Term, side: cst.CSTNode) -> List[Decider]:
+    def _shown(self, term: Term, side: ast.AST) -> List[Decider]:
         shown = source_of(term.function, side, lambda text: kind_of_words(text) == self.kind)
         around = next((decider for name, decider in term.names_around if kind_of_words(name) == self.kind), None)
-        made = source_of(term.function, side) if isinstance(side, cst.Name) else None
+        made = source_of(term.function, side) if isinstance(side, ast.Name) else None
         return [shown or around or made or term.here[0]]
 
 

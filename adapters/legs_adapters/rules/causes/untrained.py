@@ -104,7 +104,7 @@ def _may_run(program: Program, function: Function, depth: int) -> bool:
 def _names(function: Function, name: str) -> bool:
     """Return whether a function, or the top level of a file, reads, calls or imports a name."""
     flow, said = function.flow, [code(node) for node in function.flow.imports]
-    return any(name in each for each in said) or name in {*map(call_name, flow.calls), *(r.value for r in flow.reads)}
+    return any(name in each for each in said) or name in {*map(call_name, flow.calls), *(r.id for r in flow.reads)}
 
 
 def _is_called_by_framework(term: Term) -> bool:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 from dataclasses import dataclass
 from typing import List, Optional
-
-import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.tensors.absolute import absolute_value, sides_of
@@ -25,7 +24,7 @@ class Absolute(Form):
     """
 
     @classmethod
-    def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
+    def find(cls, functions: L1Functions, function: Function, call: ast.Call) -> Optional[Form]:
         """Find ``abs`` of a difference that is not of numbers."""
         found = absolute_value(call)
         sides = sides_of(found.argument) if found is not None else None

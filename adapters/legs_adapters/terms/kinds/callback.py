@@ -6,19 +6,18 @@ and calls them later with ``input=`` and ``target=``.
 
 from __future__ import annotations
 
+import ast
 from dataclasses import dataclass
 from typing import Dict, Iterator, List, Optional, Set
 
-import libcst as cst
-
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import arguments, call_name, code, constant, dotted
+from legs_adapters.code.syntax import arguments, call_name, constant, dotted, given
 from legs_adapters.lexicon.names import is_l1_name, kind_of_words
 from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.forms import Forms
-from legs_adapters.terms.text import Edit, Text
+from legs_adapters.terms.text import Edit, Text, written
 from legs_adapters.terms.writing import PACKAGE, Writing
 
 
@@ -38,7 +37,7 @@ class PassedByName(Form):
         assert self.callee is not None
         function = f"{PACKAGE}.l1_loss"
         if self.makes != "mean":
-            function = f"lambda input, target: {function}(input, target, own={code(self.callee)})"
+            function = f"lambda input, target: {function}(input, target, own={written(self.callee)})"
         return [text.replace(*text.span(self.node, True), function)]
 
 
@@ -70,28 +69,29 @@ class Callbacks:
                 targets = [reference.target for reference in self._program.resolve(function, metric)]
                 names = [str(getattr(target, "name", target)) for target in targets] or [dotted(metric) or ""]
                 if all(is_l1_name(each.split(".")[-1]) for each in names):
-                    yield PassedByName(metric, call, cst.Name("input"), cst.Name("target"), metric)
+                    first, second = (ast.Name(side, ast.Load()) for side in ("input", "target"))
+                    yield PassedByName(metric, call, first, second, metric)
 
     def _add(self, function: Function) -> None:
         shape, calls = self._forms.functions.shape, self._training.sites[function]
         known = {id(form.call) for caller in dict(calls) for form in self._forms.in_function(caller)}
-        by_name = [site for site in calls if id(site[1]) not in known and len(site[1].args) == 2]
+        by_name = [site for site in calls if id(site[1]) not in known and len(given(site[1])) == 2]
         by_name = [(caller, call) for caller, call in by_name if shape(caller) is None]
         for holder in self._program.mentioning(function.name) if by_name else ():
             near = [(caller, call) for caller, call in by_name if caller.module is holder.module]
             caller, call = (near or by_name)[0]
+            first, second = (arg.value for arg in given(call))
             for value in self._values(holder, function):
-                sides = call.args[0].value, call.args[1].value
-                form = PassedByName(value, call, *sides, value, makes=shape(function) or "own", caller=caller)
+                form = PassedByName(value, call, first, second, value, makes=shape(function) or "own", caller=caller)
                 self._by_holder.setdefault(holder, []).append(form)
                 self.assigned.add(function)
 
-    def _values(self, holder: Function, function: Function) -> Iterator[cst.BaseExpression]:
+    def _values(self, holder: Function, function: Function) -> Iterator[ast.expr]:
         """Yield the assigned values in one function that are another function, by its name."""
-        reads = {read.value for read in holder.flow.reads}
+        reads = {read.id for read in holder.flow.reads}
         for made in holder.flow.every_definition:
             is_called = "." in made.place or holder.parent is None or made.place in reads
-            if made.kind == "assign" and isinstance(made.value, (cst.Name, cst.Attribute)) and is_called:
+            if made.kind == "assign" and isinstance(made.value, (ast.Name, ast.Attribute)) and is_called:
                 references = self._program.resolve(holder, made.value)
                 if [r.target for r in references] == [function]:
                     yield made.value

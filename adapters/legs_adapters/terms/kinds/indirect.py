@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 from dataclasses import dataclass
 from typing import Iterator, Optional
-
-import libcst as cst
 
 from legs_adapters.code.module import Function
 from legs_adapters.tensors.absolute import absolute_value, sides_of
@@ -27,10 +26,10 @@ class Indirect(Form):
         difference: the ``a - b``.
     """
 
-    difference: Optional[cst.CSTNode] = None
+    difference: Optional[ast.AST] = None
 
     @classmethod
-    def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Form]:
+    def find(cls, functions: L1Functions, function: Function, call: ast.Call) -> Optional[Form]:
         """Find ``abs`` of what is made of a difference, in the expression or by its definitions."""
         found = absolute_value(call)
         made = next(_differences(function, found.argument, 0), None) if found is not None else None
@@ -40,15 +39,15 @@ class Indirect(Form):
         return cls(call, found.call, *sides, makes=found.makes, difference=made)
 
 
-def _differences(function: Function, node: cst.CSTNode, depth: int) -> Iterator[cst.CSTNode]:
+def _differences(function: Function, node: ast.AST, depth: int) -> Iterator[ast.AST]:
     """Yield the differences that an expression is a multiple, a quotient or a part of."""
     if sides_of(node):
         yield node
-    elif isinstance(node, cst.BinaryOperation) and isinstance(node.operator, (cst.Multiply, cst.Divide)):
+    elif isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Mult, ast.Div)):
         yield from _differences(function, node.left, depth)
         yield from _differences(function, node.right, depth)
-    elif isinstance(node, cst.Subscript):
+    elif isinstance(node, ast.Subscript):
         yield from _differences(function, node.value, depth)
-    elif isinstance(node, cst.Name) and depth < _DEPTH:
+    elif isinstance(node, ast.Name) and depth < _DEPTH:
         for value in function.flow.assigned(node):
             yield from _differences(function, value, depth + 1)

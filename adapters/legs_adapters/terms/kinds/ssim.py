@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 from dataclasses import dataclass
 from typing import ClassVar, List, Optional
 
-import libcst as cst
-
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import arguments, call_name, constant
+from legs_adapters.code.syntax import arguments, call_name, constant, given
 from legs_adapters.lexicon.words import STRUCTURAL
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.functions import L1Functions
@@ -29,9 +28,9 @@ class Ssim(Form):
     done: ClassVar[str] = "is computed by legs_loss.ssim"
 
     @classmethod
-    def find(cls, functions: L1Functions, function: Function, call: cst.Call) -> Optional[Ssim]:
+    def find(cls, functions: L1Functions, function: Function, call: ast.Call) -> Optional[Ssim]:
         """Find a call of a function that is named as an SSIM; what it computes is checked later."""
-        inner = call_name(call.func) if isinstance(call.func, cst.Call) else ""  # SSIM()(image, gt)
+        inner = call_name(call.func) if isinstance(call.func, ast.Call) else ""  # SSIM()(image, gt)
         if not STRUCTURAL.search(call_name(call) or inner):
             return None
         positional, _, starred = arguments(call)
@@ -40,12 +39,12 @@ class Ssim(Form):
         is_patched = any(r.kind == "external" and str(r.target).startswith("legs_loss.") for r in references)
         if is_patched or starred or len(pair) < 2:
             return None
-        return cls(call, call, pair[0], pair[1], call.func, tuple(call.args[2:]))
+        return cls(call, call, pair[0], pair[1], call.func, tuple(given(call)[2:]))
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace the function; the further arguments are the defaults of ``legs_loss.ssim``, and are dropped."""
         function, call = text.span(self.call.func, True), text.span(self.call)
-        second, last = (text.span(self.call.args[at])[1] for at in (1, -1))
+        second, last = (text.argument_span(self.call, at)[1] for at in (1, -1))
         arguments = (
             text.between(function[1], second) + residue(text.between(second, last)) + text.between(last, call[1])
         )

@@ -41,7 +41,7 @@ CASES = {
     "5 MB of literal": ("x = [" + "1.25, " * 900_000 + "]", "larger than 1 MiB"),
     "900 kB of literal": ("x = [" + "1.25, " * 150_000 + "]", STEPS),
     "130,000 statements": ("a\n" * 130_000, ""),
-    "8,000 small functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(8000)), STEPS),
+    "8,000 small functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(8000)), ""),
     "3,000 trained terms": (
         "def f(a, b):\n" + "    l1 = l1_loss(render(a)['render'], b.original_image); l1.backward()\n" * 3000,
         "",
@@ -55,7 +55,7 @@ CASES = {
     "20,000 signs": ("x = " + "-" * 20_000 + "a", PARTS),
     "20,000 strings": ("x = " + " ".join(["'l1_loss'"] * 20_000), PARTS),
     "20,000 choices": ("x = " + "1 if a else " * 20_000 + "1", PARTS),
-    "20,000 lambdas": ("x = " + "lambda a, b: " * 20_000 + "1", ""),
+    "20,000 lambdas": ("x = " + "lambda a, b: " * 20_000 + "1", "is nested too deeply"),
     "20,000 lines": ("x = 1 + \\\n" * 20_000 + "1", PARTS),
     "a field of 20,000 parts": ("x = f'{" + "+".join(["a"] * 20_000) + "}'", PARTS),
     "a list of 10,000 parts": ("x = [" + ", ".join(["-a.b[0]"] * 10_000) + "]", ""),
@@ -64,9 +64,9 @@ CASES = {
     "400 blocks": ("".join(" " * i + "if a:\n" for i in range(400)) + " " * 400 + "x = 1", "does not parse"),
     "5,000 functions in one": (
         "def f():\n" + "".join(f"    def f{i}(a, b):\n        return l1_loss(a, b)\n\n" for i in range(5000)),
-        STEPS,
+        "",
     ),
-    "a double byte order mark": ("\ufeff\ufeffl1_loss(a, b)", "cannot be written back exactly"),
+    "a double byte order mark": ("\ufeff\ufeffl1_loss(a, b)", "does not parse"),
 }
 
 

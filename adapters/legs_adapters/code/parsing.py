@@ -103,7 +103,7 @@ class Lines:
         Raises:
             SyntaxError, ValueError, RecursionError, MemoryError: it does not parse.
         """
-        tree = read_by_python(self.data)
+        tree = read_by_python(self.data.decode("utf-8"))
         if not isinstance(tree, ast.Module):
             raise tree
         if sys.version_info < (3, 10):

@@ -47,10 +47,12 @@ class Function:
     @remembered
     def text(self) -> str:
         """Its body as written; of a top level the file without the bodies of its functions."""
-        data, cuts = self.module.lines.data, [each.span for each in self.module.functions if self.parent is None]
+        data = self.module.lines.data
+        if self.parent is not None:
+            return data[self.span].decode("utf-8")
+        cuts = [each.span for each in self.module.functions]
         starts, ends = [0, *(cut.stop for cut in cuts)], [*(cut.start for cut in cuts), len(data)]
-        pieces = [self.span] if self.parent is not None else [slice(*each) for each in zip(starts, ends)]
-        return b"".join(data[piece] for piece in pieces).decode("utf-8")
+        return b"".join(data[start:end] for start, end in zip(starts, ends)).decode("utf-8")
 
     @property
     def span(self) -> slice:

@@ -49,9 +49,9 @@ class Lines:
         """Return one line, without the white space around it."""
         return self.data[self.start(line) : self.start(line + 1)].decode("utf-8").strip()
 
-    def code(self, node: Any) -> str:
-        """Return the text of a node."""
-        place = self.place(node)
+    def code(self, node: Any, brackets: bool = False) -> str:
+        """Return the text of a node, on request with the brackets around it."""
+        place = self.place(node, brackets)
         return self.data[place.start : place.end].decode("utf-8", "replace")
 
     def place(self, node: Any, brackets: bool = False) -> Place:

@@ -26,10 +26,10 @@ class Arg(NamedTuple):
     star: str
 
 
-def code(node: ast.AST) -> str:
-    """Return a node's text in its file, without brackets around it; of a name that was made here, that name."""
+def code(node: ast.AST, brackets: bool = False) -> str:
+    """Return a node's text in its file, on request with brackets around it; of a name that was made here, that name."""
     lines = getattr(node, "source", None)
-    return str(lines.code(node)) if lines is not None else name_of(node)
+    return str(lines.code(node, brackets)) if lines is not None else name_of(node)
 
 
 def one_line(node: ast.AST) -> str:
@@ -44,6 +44,12 @@ def name_of(node: ast.AST) -> str:
         if isinstance(name, str):
             return name
     return ""
+
+
+def said_by(node: ast.AST) -> str:
+    """Return what a node says itself: its identifier, or a string's text; or ""."""
+    text = constant(node) if isinstance(node, ast.Constant) else name_of(node)
+    return text if isinstance(text, str) else ""
 
 
 def dotted(node: ast.AST) -> Optional[str]:
@@ -209,8 +215,4 @@ def every_parameter(parameters: ast.arguments) -> Iterator[Tuple[ast.arg, Option
 
 def words_in(*nodes: ast.AST) -> Set[str]:
     """Return the words of the names and strings in expressions."""
-    found: Set[str] = set()
-    for node in walk_expressions(*nodes):
-        text = constant(node) if isinstance(node, ast.Constant) else name_of(node)
-        found.update(words(text) if isinstance(text, str) else ())
-    return found
+    return {word for node in walk_expressions(*nodes) for word in words(said_by(node))}

@@ -59,8 +59,9 @@ def find(
         budget: the steps that it may take; default: its own.
     """
     program = Program(sources, MODULE_SELF, MODULE_WRAPS, budget)
-    with progress(len(program.paths_matching(_TO_READ)), "files read") as bar:  # half when parsed, half when judged
-        program.when_read = lambda path: bar.update(0.5 * (path in program.paths_matching(_TO_READ)))
+    read = set(program.paths_matching(_TO_READ))
+    with progress(len(read), "files read") as bar:  # half of a file when it is parsed, half when it was judged
+        program.when_read = lambda path: bar.update(0.5 * (path in read))
         analysis = Analysis(program)
         found = _Search(analysis, by_hand, bar).run()
     found = with_trace(found, analysis, trace) if trace is not None and not by_hand else found

@@ -12,7 +12,7 @@ import inspect
 from typing import TYPE_CHECKING, Callable, Iterator, List, Optional, Sequence, Tuple
 
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import constant, name_of, walk_expressions
+from legs_adapters.code.syntax import said_by, walk_expressions
 from legs_adapters.lexicon.masks import is_rows
 from legs_adapters.lexicon.meaning import swapped
 from legs_adapters.terms.findings import Decider
@@ -124,8 +124,7 @@ def source_of(
     """
     parts = list(walk_expressions(node))
     for part in parts if says is not None else ():
-        text = constant(part) if isinstance(part, ast.Constant) else name_of(part)
-        if says is not None and isinstance(text, str) and says(text):
+        if says is not None and said_by(part) and says(said_by(part)):
             return function, part
     definitions = [made for part in parts for made in function.flow.reaching(part)]
     for made in definitions if depth < _DEPTH else ():

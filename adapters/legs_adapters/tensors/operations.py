@@ -56,7 +56,6 @@ MODULE_SELF = word_set("cpu cuda double eval float half requires_grad_ to train"
 # These return a module wrapped; Lightning's fabric.setup, accelerate's prepare.
 MODULE_WRAPS = word_set("DDP DataParallel DistributedDataParallel compile convert_sync_batchnorm fabric.setup prepare")
 TRANSPARENT = word_set("autocast classmethod compile jaxtyped script staticmethod typechecked")  # decorators
-HOLDERS = word_set("ModuleDict OrderedDict dict functools.partial nn.ModuleDict partial torch.nn.ModuleDict")
 HOOKS = word_set("get_loss_dict get_train_loss_dict training_step")  # a framework trains on what they return
 # Words in the names of optimisers, of what steps them, and of what has a step() of another kind.
 OPTIMISERS = word_set("optimiser optimisers optimizer optimizers")

@@ -14,7 +14,7 @@ from legs_adapters.code.syntax import (
     given,
     indices,
     key_of,
-    name_of,
+    said_by,
     same,
     walk_expressions,
     words,
@@ -28,7 +28,6 @@ from legs_adapters.lexicon.words import OF_RAYS, STRUCTURAL
 from legs_adapters.tensors.absolute import is_no_picture
 from legs_adapters.tensors.operations import MODULES
 from legs_adapters.terms.form import Form
-from legs_adapters.terms.text import written
 
 
 class Pair(NamedTuple):
@@ -58,7 +57,7 @@ def pair_of(meanings: Meanings, ways: Ways, function: Function, form: Form) -> P
     """Return the two sides of a form, with their meanings."""
     first, second, selection = form.first, form.second, ""
     if isinstance(first, ast.Subscript) and isinstance(second, ast.Subscript):
-        inner = [written(node)[len(written(node.value)) :] for node in (first, second)]
+        inner = [code(node, True)[len(code(node.value, True)) :] for node in (first, second)]
         squeezed = [re.sub(r"\s+", "", text) for text in inner]
         if squeezed[0] == squeezed[1] and any(is_mask(meanings, function, index) for index in indices(first)):
             # the weight map needs the whole image
@@ -118,8 +117,4 @@ def is_role(node: ast.AST) -> bool:
 
 def speaks_of_images(node: ast.AST) -> bool:
     """Return whether a name in it is about images."""
-    parts = list(walk_expressions(node))
-    formatted = {id(value) for part in parts if isinstance(part, ast.JoinedStr) for value in part.values}
-    strings = [part for part in parts if isinstance(part, ast.Constant) and id(part) not in formatted]
-    names = [part.value for part in strings if isinstance(part.value, str)] + list(filter(None, map(name_of, parts)))
-    return "image" in map(kind_of_words, names)
+    return "image" in (kind_of_words(said_by(part)) for part in walk_expressions(node))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from typing import Any, NamedTuple, Sequence, Tuple
+from typing import NamedTuple, Sequence, Tuple
 
 from legs_adapters.code.limits import STRING
 from legs_adapters.code.module import Function, Module
@@ -65,17 +65,8 @@ class Text:
     def argument(self, node: ast.expr, index: str) -> str:
         """Return an image as written, without the index that it carries."""
         if not index or not isinstance(node, ast.Subscript):
-            return written(node)
-        return written(node.value) + residue(self.between(self.span(node.value, True)[1], self.span(node)[1]))
-
-
-def written(node: Any) -> str:
-    """Return a node as written, with the brackets around it; of a name that was made here, that name."""
-    lines = getattr(node, "source", None)
-    if lines is None:
-        return code(node)
-    place = lines.place(node, True)
-    return str(lines.data[place.start : place.end].decode("utf-8"))
+            return code(node, True)
+        return code(node.value, True) + residue(self.between(self.span(node.value, True)[1], self.span(node)[1]))
 
 
 def names_for_two(text: str) -> Tuple[str, str]:
@@ -87,7 +78,7 @@ def names_for_two(text: str) -> Tuple[str, str]:
 
 def flat(arg: Arg) -> str:
     """Return an argument on one line, with its keyword or stars."""
-    value = on_one_line(written(arg.value))
+    value = on_one_line(code(arg.value, True))
     return f"{arg.keyword}={value}" if arg.keyword else f"{arg.star}{value}"
 
 

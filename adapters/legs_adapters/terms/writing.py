@@ -5,8 +5,8 @@ from __future__ import annotations
 import ast
 from typing import NamedTuple, Sequence, Tuple
 
-from legs_adapters.code.syntax import Arg
-from legs_adapters.terms.text import flat, names_for_two, on_one_line, written
+from legs_adapters.code.syntax import Arg, code
+from legs_adapters.terms.text import flat, names_for_two, on_one_line
 
 PACKAGE = "legs_loss"
 
@@ -39,7 +39,7 @@ class Writing(NamedTuple):
 
     def own(self, callee: ast.expr, extras: Sequence[Arg]) -> str:
         """Return the codebase's own function of (prediction, target), with its further arguments."""
-        name = on_one_line(written(callee))
+        name = on_one_line(code(callee, True))
         if not extras and not self.selection and not self.swapped:
             return name
         others = ", ".join(flat(arg) for arg in extras)

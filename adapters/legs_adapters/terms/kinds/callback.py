@@ -12,12 +12,12 @@ from typing import Dict, Iterator, List, Optional, Set
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program
-from legs_adapters.code.syntax import arguments, call_name, constant, dotted, given
+from legs_adapters.code.syntax import arguments, call_name, code, constant, dotted, given
 from legs_adapters.lexicon.names import is_l1_name, kind_of_words
 from legs_adapters.tensors.backward import Training
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.forms import Forms
-from legs_adapters.terms.text import Edit, Text, written
+from legs_adapters.terms.text import Edit, Text
 from legs_adapters.terms.writing import PACKAGE, Writing
 
 
@@ -37,7 +37,7 @@ class PassedByName(Form):
         assert self.callee is not None
         function = f"{PACKAGE}.l1_loss"
         if self.makes != "mean":
-            function = f"lambda input, target: {function}(input, target, own={written(self.callee)})"
+            function = f"lambda input, target: {function}(input, target, own={code(self.callee, True)})"
         return [text.replace(*text.span(self.node, True), function)]
 
 

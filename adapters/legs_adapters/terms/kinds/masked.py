@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import ClassVar, List, Optional
 
 from legs_adapters.code.module import blocks_of
+from legs_adapters.code.syntax import code
 from legs_adapters.terms.form import Form
-from legs_adapters.terms.text import Edit, Text, on_one_line, written
+from legs_adapters.terms.text import Edit, Text, on_one_line
 from legs_adapters.terms.writing import PACKAGE, Writing
 
 
@@ -34,7 +35,7 @@ class Masked(Form):
     @property
     def line(self) -> str:
         """The line, for the edit and for advice."""
-        rendering, photograph = (on_one_line(written(side)) for side in (self.first, self.second))
+        rendering, photograph = (on_one_line(code(side, True)) for side in (self.first, self.second))
         return f"{rendering} = {PACKAGE}.masked({rendering}, {photograph})"
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:

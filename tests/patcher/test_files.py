@@ -244,7 +244,7 @@ class TestWhereItLooks:
             (b"def f(:\n", "does not parse (line 1: "),
             (
                 b"class A:\n    def f(self):\n\tx = l1(1)\n",
-                "does not parse (line 3: inconsistent use of tabs and spaces in indentation)",
+                "does not parse (line 3: inconsistent use of tabs and spaces in indentation; Python 3.",
             ),
             (b"# -*- coding: latin-1 -*-\nx = '\xe9'\n", "not UTF-8 (byte 31)"),
             (b"x = '\xe9'\n", "not UTF-8 (byte 5)"),

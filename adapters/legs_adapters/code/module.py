@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from dataclasses import dataclass
+from platform import python_version
 from typing import Any, Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, TypeVar
 
 from legs_adapters.code.flow import Flow
@@ -223,7 +224,7 @@ def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadabl
 
 def _failure(path: str, error: Exception) -> Unreadable:
     if isinstance(error, SyntaxError):
-        return Unreadable(path, f"does not parse (line {error.lineno}: {error.msg})")
+        return Unreadable(path, f"does not parse (line {error.lineno}: {error.msg}; Python {python_version()})")
     if isinstance(error, (RecursionError, MemoryError)):
         return Unreadable(path, "is nested too deeply")
     return Unreadable(path, f"cannot be parsed: {type(error).__name__}")

@@ -37,11 +37,12 @@ SCHEDULE_COLUMNS = {
     "strongest 10%": ".2f",
     "Gaussians": ",.0f",
 }
-SCHEDULE_ARMS = ("3dgs", "legs", "3dgs@legs", "legs:lambda=0.418@3dgs", "legs:mean1@3dgs", "legs-l", "eggs")
+_BY_PARTS = ("legs:until=15000", "legs:from=15000")  # announced in preregistered_schedule.md
+SCHEDULE_ARMS = ("3dgs", "legs", "3dgs@legs", "legs:lambda=0.418@3dgs", "legs:mean1@3dgs", "legs-l", "eggs", *_BY_PARTS)
 SCHEDULE_TICKS = (500, 1000, 2000, 4000, 7000, 15000, 30000)
 SCHEDULE_KEPT = ("train", "test", "gaussians", "mean_weight", "processor_seconds")
 PAPERS_SCORES = {"psnr": ".2f", "ssim": ".4f", "lpips": ".4f"}
-COLOURS = ("#555555", "#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b")
+COLOURS = ("#555555", "#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#17becf")
 COLUMNS = {
     "train PSNR": ("train", "psnr"),
     "held-out PSNR": ("test", "psnr"),

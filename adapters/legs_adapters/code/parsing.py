@@ -8,20 +8,18 @@ from __future__ import annotations
 
 import ast
 import bisect
-import io
 import itertools
 import keyword
 import re
 import sys
-import tokenize
 import warnings
 from typing import Any, List, NamedTuple, Tuple
 
-from legs_adapters.code.limits import remembered
+from legs_adapters.code.limits import STRING, remembered
 from legs_adapters.code.syntax import FUNCTIONS, children
 
 _NEWLINE = re.compile(rb"\r\n|\r|\n")
-_NO_TOKENS = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
+_TOKEN = re.compile(rf"\#[^\r\n]*|({STRING}|[\w\x80-\xff]+|\*\*|[^\s\\])".encode(), re.S)  # a group, but for a comment
 
 
 class Place(NamedTuple):
@@ -64,14 +62,14 @@ class Lines:
 
     def _with_brackets(self, start: int, end: int) -> Tuple[int, int]:
         """Return the span of what stands there with the brackets around it, but for those of a call."""
-        starts, ends, texts = self._tokens()
-        first, last = bisect.bisect_left(starts, start), bisect.bisect_left(ends, end)
+        starts, texts = self._tokens()
+        first, last = bisect.bisect_left(starts, start), bisect.bisect_left(starts, end) - 1
         while texts[first - 1 : first] == ["("] and texts[last + 1 : last + 2] == [")"]:
             before = texts[first - 2] if first > 1 else "="
             if (before[-1:] in "\"')]}" or before.isidentifier()) and not keyword.iskeyword(before):
                 break
             first, last = first - 1, last + 1
-            start, end = starts[first], ends[last]
+            start, end = starts[first], starts[last] + 1
         return start, end
 
     def before(self, start: int, count: int) -> int:
@@ -80,12 +78,10 @@ class Lines:
         return starts[bisect.bisect_left(starts, start) - count]
 
     @remembered
-    def _tokens(self) -> Tuple[List[int], List[int], List[str]]:
-        """Return where the tokens begin, where they end, and their texts."""
-        text = io.StringIO(self.data.decode("utf-8"), newline=None)
-        found = [each for each in tokenize.generate_tokens(text.readline) if each.type not in _NO_TOKENS]
-        starts, ends = ([self.byte(*place) for place in places] for places in zip(*((t.start, t.end) for t in found)))
-        return starts, ends, [each.string for each in found]
+    def _tokens(self) -> Tuple[List[int], List[str]]:
+        """Return where the tokens begin, and their texts. Of `tokenize` each Python has another, some slow or wrong."""
+        found = [match for match in _TOKEN.finditer(self.data) if match.group(1)]
+        return [match.start() for match in found], [match.group().decode("utf-8") for match in found]
 
     def byte(self, line: int, letter: int) -> int:
         """Return the byte at which a letter of a line begins."""

@@ -34,7 +34,7 @@ def rewrite(findings: Findings, path: str, in_place: bool = False) -> List[Edit]
 
     Raises:
         LegsError: the file has a legs_loss of its own; or the result would not compile (a bug of legs-patch).
-        ValueError: this Python cannot compile the file.
+        ValueError: this Python cannot compile the file, or one term is in another.
     """
     source, module = findings.program.sources[path], findings.program.module(path)
     assert module is not None
@@ -44,7 +44,7 @@ def rewrite(findings: Findings, path: str, in_place: bool = False) -> List[Edit]
         edits += site.form.edits(Text(source, site.scope), site.writing(in_place))
     for use in (each for each, _ in findings.unweighted if each.caller.module.path == path):
         text = Text(source, use.caller)
-        start, end = text.span(use.call.func, True)
+        start, end = text.span(use.call.func)
         edits.append(text.replace(start, end, f"{PACKAGE}.unweighted({text.between(start, end)})"))
     if not (is_imported or in_place):
         edits.append(_import(Text(source, module.top)))

@@ -7,6 +7,7 @@ import textwrap
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from legs_adapters.cli import main
 from legs_adapters.plan import plan, write
 from legs_adapters.undo import undo
 
@@ -72,6 +73,30 @@ def test_bytes_that_are_not_the_edit_stay(change, tmp_path):
     write(found)
     undo(root)
     assert (root / "train.py").read_bytes() == data
+
+
+@pytest.mark.parametrize(
+    ("before", "written"),
+    [
+        ("1 if x else(image - gt_image).abs().mean()", "1 if x else legs_loss.l1_loss(image, gt_image)"),
+        ("(l1_loss  # ours\n        )(image, gt_image)", "(legs_loss.l1_loss  # ours\n        )(image, gt_image)"),
+        ("not(l1_loss)(image, gt_image)", "not(legs_loss.l1_loss)(image, gt_image)"),
+    ],
+    ids=["no space", "a comment in brackets", "brackets after a word"],
+)
+def test_what_stands_close_to_a_term_stays(before, written, tmp_path):
+    text = ONE_FILE.replace("        SITE\n", f"        Ll1 = {before}\n")
+    root = checkout(tmp_path, {**files("inria"), "train.py": text})
+    write(plan(root))
+    assert f"        Ll1 = {written}\n" in (root / "train.py").read_text(encoding="utf-8")
+
+
+def test_a_term_in_another_is_left_to_the_user(tmp_path, capsys):
+    term = "        Ll1 = l1_loss(image, gt_image * l1_loss(image, gt_image))\n"
+    root = checkout(tmp_path, {**files("inria"), "train.py": ONE_FILE.replace("        SITE\n", term)})
+    assert main([str(root)]) == 2
+    assert "train.py: one term is in another: weight the inner one by hand" in capsys.readouterr().err
+    assert (root / "train.py").read_text(encoding="utf-8").count("legs_loss") == 0
 
 
 SPACES = st.sampled_from(["", " ", "  ", "\n                ", "  # why\n            ", " \\\n            "])

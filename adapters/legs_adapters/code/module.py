@@ -224,10 +224,10 @@ def parse(source: Source, budget: Optional[Budget] = None) -> Module | Unreadabl
 
 def _failure(path: str, error: Exception) -> Unreadable:
     if isinstance(error, SyntaxError):
-        return Unreadable(path, f"does not parse (line {error.lineno}: {error.msg}; Python {python_version()})")
+        return Unreadable(path, f"does not parse (line {error.lineno or '?'}: {error.msg}; Python {python_version()})")
     if isinstance(error, (RecursionError, MemoryError)):
         return Unreadable(path, "is nested too deeply")
-    return Unreadable(path, f"cannot be parsed: {type(error).__name__}")
+    return Unreadable(path, f"does not parse ({error})")
 
 
 def _definitions(body: Iterable[ast.AST]) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef]:

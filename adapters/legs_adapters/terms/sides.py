@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import re
 from typing import List, NamedTuple, Sequence
 
 from legs_adapters.code.module import Function
@@ -28,6 +27,7 @@ from legs_adapters.lexicon.words import OF_RAYS, STRUCTURAL
 from legs_adapters.tensors.absolute import is_no_picture
 from legs_adapters.tensors.operations import MODULES
 from legs_adapters.terms.form import Form
+from legs_adapters.terms.text import on_one_line
 
 
 class Pair(NamedTuple):
@@ -56,12 +56,10 @@ def surest(meanings: Meanings, ways: Ways, function: Function, sides: Sequence[a
 def pair_of(meanings: Meanings, ways: Ways, function: Function, form: Form) -> Pair:
     """Return the two sides of a form, with their meanings."""
     first, second, selection = form.first, form.second, ""
-    if isinstance(first, ast.Subscript) and isinstance(second, ast.Subscript):
-        inner = [code(node, True)[len(code(node.value, True)) :] for node in (first, second)]
-        squeezed = [re.sub(r"\s+", "", text) for text in inner]
-        if squeezed[0] == squeezed[1] and any(is_mask(meanings, function, index) for index in indices(first)):
-            # the weight map needs the whole image
-            first, second, selection = first.value, second.value, inner[0].strip()
+    if isinstance(first, ast.Subscript) and isinstance(second, ast.Subscript) and same(first.slice, second.slice):
+        is_by_mask = any(is_mask(meanings, function, index) for index in indices(first))
+        selection = on_one_line(code(first)[len(code(first.value, True)) :]) if is_by_mask else ""
+        first, second = (first.value, second.value) if is_by_mask else (first, second)  # the weight map needs all of it
     sides = _without_shared_factors(first, second)
     answers = surest(meanings, ways, function, sides)
     a, b = (answers.meaning(function, side) for side in sides)

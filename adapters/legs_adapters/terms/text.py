@@ -24,10 +24,11 @@ class Edit(NamedTuple):
 
 
 def apply_edits(data: bytes, edits: Sequence[Edit]) -> bytes:
-    """Return the file's bytes with the edits made."""
+    """Return the file's bytes with the edits made; a ValueError says that one is in another."""
     parts, at = [], 0
     for edit in sorted(edits):
-        assert edit.start >= at
+        if edit.start < at:
+            raise ValueError("one term is in another: weight the inner one by hand")
         parts += [data[at : edit.start], edit.after]
         at = edit.end
     return b"".join([*parts, data[at:]])
@@ -53,10 +54,10 @@ class Text:
         return self.bytes[start:end].decode("utf-8")
 
     def argument_span(self, call: ast.Call, at: int) -> Tuple[int, int]:
-        """Return where an argument of a call begins and ends, its keyword or stars included."""
-        value, keyword, star = given(call)[at]
+        """Return where an argument of a call begins and ends, its keyword included."""
+        value, keyword, _ = given(call)[at]
         start, end = self.span(value, True)
-        return self.module.lines.before(start, 2 if keyword else len(star) > 0), end
+        return self.module.lines.before(start, 2) if keyword else start, end
 
     def replace(self, start: int, end: int, after: str) -> Edit:
         """Return the edit that replaces a span of bytes by a text."""

@@ -39,5 +39,5 @@ class Absolute(Form):
         settings = writing.settings(as_map=bool(writing.selection) or self.makes == "none")
         tail = writing.selection + (".mean()" if writing.selection and self.makes == "mean" else "")
         before, after = residue(text.between(start, left[0])), residue(text.between(right[1], end))
-        arguments = f"{before}{sides[0]},{middle}{sides[1]}{settings}{after}"
-        return [text.replace(start, end, f"{PACKAGE}.l1_loss({arguments}){tail}")]
+        name = f"{' ' * text.between(start - 1, start).isalnum()}{PACKAGE}.l1_loss"  # return(image - gt_image).abs()
+        return [text.replace(start, end, f"{name}({before}{sides[0]},{middle}{sides[1]}{settings}{after}){tail}")]

@@ -38,7 +38,7 @@ class PassedByName(Form):
         function = f"{PACKAGE}.l1_loss"
         if self.makes != "mean":
             function = f"lambda input, target: {function}(input, target, own={code(self.callee, True)})"
-        return [text.replace(*text.span(self.node, True), function)]
+        return [text.replace(*text.span(self.node), function)]
 
 
 class Callbacks:

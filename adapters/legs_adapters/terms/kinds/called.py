@@ -50,14 +50,14 @@ class Called(Form):
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace the function, order the two images, and replace the further arguments by the settings."""
-        function, call = text.span(self.call.func, True), text.span(self.call)
+        function, call = text.span(self.call.func), text.span(self.call)
         first, second, last = (text.argument_span(self.call, at) for at in (0, 1, -1))
         sides = writing.ordered(*(text.argument(side, writing.selection) for side in (self.first, self.second)))
         tail = writing.selection if self.makes != "own" else ""
         own = writing.own(self.call.func, self.extras) if self.makes == "own" else ""
         settings = writing.settings(self.makes == "none" or bool(tail), own)
         tail += ".mean()" if tail and self.makes == "mean" else ""
-        before, between = text.between(function[1], first[0]), text.between(first[1], second[0])
+        before = text.between(function[1], first[0]) + residue(text.between(*function))
         after = residue(text.between(second[1], last[1])) + text.between(last[1], call[1])
-        arguments = f"{before}{sides[0]}{between}{sides[1]}{settings}{after}"
+        arguments = f"{before}{sides[0]}{text.between(first[1], second[0])}{sides[1]}{settings}{after}"
         return [text.replace(function[0], call[1], f"{PACKAGE}.l1_loss{arguments}{tail}")]

@@ -23,4 +23,4 @@ class Reread(Form):
         """Write the weighted map in the read's place."""
         sides = (on_one_line(text.argument(side, writing.selection)) for side in (self.first, self.second))
         arguments = f"{', '.join(writing.ordered(*sides))}{writing.settings(as_map=True)}"
-        return [text.replace(*text.span(self.node, True), f"{PACKAGE}.l1_loss({arguments}){writing.selection}")]
+        return [text.replace(*text.span(self.node), f"{PACKAGE}.l1_loss({arguments}){writing.selection}")]

@@ -43,7 +43,7 @@ class Ssim(Form):
 
     def edits(self, text: Text, writing: Writing) -> List[Edit]:
         """Replace the function; the further arguments are the defaults of ``legs_loss.ssim``, and are dropped."""
-        function, call = text.span(self.call.func, True), text.span(self.call)
+        function, call = text.span(self.call.func), text.span(self.call)
         second, last = (text.argument_span(self.call, at)[1] for at in (1, -1))
         arguments = (
             text.between(function[1], second) + residue(text.between(second, last)) + text.between(last, call[1])

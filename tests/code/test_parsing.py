@@ -122,6 +122,8 @@ def test_every_node_of_a_real_file_stands_where_it_stands(path: Path) -> None:
         ("lambda: (a)", "(a)"),
         ("def f():\n    return (a)", "(a)"),
         ("b = 'é' and (a)", "(a)"),
+        ("b = '''\n日本語'''; (a)", "(a)"),
+        ("b('''\n日本語''', (a))", "(a)"),
     ],
 )
 def test_brackets_around_a_node_are_its_own_and_not_a_calls(text: str, wanted: str) -> None:
@@ -140,12 +142,25 @@ def named(module: Module, name: str) -> Function:
     [
         ("def f(:\n    pass\n", "does not parse (line 1: "),
         ("x = 1\n\n\ndef f():\n    return 1 2\n", "does not parse (line 5: "),
+        ("x = 1\0\n", "does not parse ("),
     ],
 )
 def test_what_does_not_parse_is_said_of_the_file(text: str, reason: str) -> None:
     found = parse(Source("file.py", text.encode(), text))
     assert isinstance(found, Unreadable)
     assert found.reason.startswith(reason)
+    assert "None" not in found.reason
+
+
+@pytest.mark.parametrize("end", ["\\\n", "\\\r\n", " \\\n\n"])
+def test_a_file_that_ends_in_a_backslash_is_read_or_said_not_to_parse(end: str) -> None:
+    text = f"f((a))\n{end}"
+    found = parse(Source("file.py", text.encode(), text))
+    if isinstance(found, Unreadable):
+        assert found.reason.startswith("does not parse (")
+    else:
+        (node,) = [node for node in ast.walk(found.top.node) if isinstance(node, ast.Name) and node.id == "a"]
+        assert code(node, True) == "(a)"
 
 
 STORED = """

@@ -72,10 +72,9 @@ class Lines:
             start, end = starts[first], starts[last] + 1
         return start, end
 
-    def before(self, start: int, count: int) -> int:
-        """Return where the token begins that stands so many before the one at a byte."""
-        starts = self._tokens()[0]
-        return starts[bisect.bisect_left(starts, start) - count]
+    def keyword_start(self, brackets: int, value: int) -> int:
+        """Return where the keyword of an argument begins: of a value at a byte, in a call's brackets at another."""
+        return [match.start() for match in _TOKEN.finditer(self.data, brackets, value) if match.group(1)][-2]
 
     @remembered
     def _tokens(self) -> Tuple[List[int], List[str]]:

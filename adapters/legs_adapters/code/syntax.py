@@ -160,12 +160,12 @@ def entries(node: ast.AST) -> List[Tuple[ast.expr, ast.expr]]:
 def children(node: ast.AST) -> List[ast.AST]:
     """Return a node's direct children, without operators, and of an f-string without its texts.
 
-    Before Python 3.9 an f-string has none: the parser does not know where in the file they stand.
+    Before Python 3.10 an f-string has none: the parser does not know where in the file they stand.
     """
     if isinstance(node, ast.Dict):
         return [each for pair in zip(node.keys, node.values) for each in pair if each is not None]
     if isinstance(node, ast.JoinedStr):
-        return [each for each in node.values if isinstance(each, ast.FormattedValue) and sys.version_info >= (3, 9)]
+        return [each for each in node.values if isinstance(each, ast.FormattedValue) and sys.version_info >= (3, 10)]
     found: List[ast.AST] = []
     for name in _fields(type(node)):  # type: ignore[arg-type]
         value = getattr(node, name, None)

@@ -57,7 +57,7 @@ class Text:
         """Return where an argument of a call begins and ends, its keyword included."""
         value, keyword, _ = given(call)[at]
         start, end = self.span(value, True)
-        return self.module.lines.before(start, 2) if keyword else start, end
+        return self.module.lines.keyword_start(self.span(call.func)[1], start) if keyword else start, end
 
     def replace(self, start: int, end: int, after: str) -> Edit:
         """Return the edit that replaces a span of bytes by a text."""

@@ -151,7 +151,7 @@ LABORIOUS = {
     "a sum of 100 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 100)), True),
     "a sum of 601 terms": ("def f(cam, gaussians):\n" + SUM.format(" + ".join(["l1_loss(image, gt)"] * 601)), True),
     "650 lambdas": ("def f():\n    g = " + "lambda: " * 650 + "0\n", True),
-    "1,500 lambdas": ("def f():\n    g = " + "lambda: " * 1500 + "0\n", True),
+    "1,500 lambdas": ("def f():\n    g = " + "lambda: " * 1500 + "0\n", sys.version_info >= (3, 9)),
     "1,000 functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(1000)), True),
     "9,000 functions": ("".join(f"def f{i}(a, b):\n    return l1_loss(a, b)\n\n" for i in range(9000)), True),
     "400 branches": (step("if c:\n    image = image * gt\nelse:\n    gt = gt + image\n" * 400), True),
@@ -288,7 +288,8 @@ def test_the_steps_grow_with_the_code(what, options, tmp_path, monkeypatch):
             plan(tmp_path, **options)
         finally:
             sys.setprofile(None)
-        assert calls[0] < 12 * spent[0]  # none is a walk that nobody counts
+        most = 12 if sys.version_info >= (3, 8) else 16  # asttokens looks at each node, too
+        assert calls[0] < most * spent[0]  # none is a walk that nobody counts
         return spent[0], calls[0]
 
     cost(statement)  # what is remembered of words

@@ -155,7 +155,7 @@ def test_git_lfs_runs_no_extension_of_the_checkout_s(attack):
     refused = run(root, ran=ran, **environment)
     assert (refused.returncode, "(train.py): commit them" in refused.stderr) == (2, True)
     assert not ran.exists()
-    subprocess.run(["git", "-C", str(root), "status"], stdout=subprocess.DEVNULL, env=dict(os.environ, **environment))
+    subprocess.run(["git", "-C", str(root), "add", "."], stdout=subprocess.DEVNULL, env=dict(os.environ, **environment))
     assert ran.exists(), "the premise, or this proves nothing"
     ran.unlink()
 

@@ -11,7 +11,7 @@ together. Then, as far as it goes: waits for the device; CUDA graphs; a second s
 simple_trainer.py trained likewise. Each runs in a process of its own, with a time limit, and writes what it finds to
 the file at once. A stage that fails or cannot be done here is named with the reason, and the next one begins.
 
-The package must be installed (`pip install -e ".[patch]"`) and the checkouts be fetched with their submodules; nothing
+The package must be installed (`pip install -e .`) and the checkouts be fetched with their submodules; nothing
 is written into them, and nothing is downloaded. With --emulate the kernels' source is compiled with g++ and runs on
 the CPU: it tries this script, its times mean nothing, and what only a GPU has is said to need CUDA.
 """

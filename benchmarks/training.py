@@ -108,7 +108,7 @@ def measure(args):
         setattr(owner, name, call)
 
     def sized(*given):
-        splats, draws, entries = given[4:7]
+        splats, draws, entries = given[-6:-3]
         sizes.update(gaussians=len(splats), entries=len(entries))
         rows = (draws[:, 1] >> 8 & 255) - (draws[:, 1] & 255)
         sizes["rows"] = int(rows.sum())

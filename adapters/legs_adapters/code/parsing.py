@@ -144,7 +144,7 @@ def _with_ends(tree: ast.Module, lines: Lines) -> None:
     """Let the nodes of a tree of Python 3.7 know where they begin and end, as those of later Pythons do."""
     from asttokens import ASTTokens
 
-    text = re.sub("\r(?!\n)", "\n", lines.data.decode("utf-8"))  # which it takes for no end of a line
+    text = re.sub("\r(?!\n)", "\n", lines.data.decode("utf-8")).rstrip(" \t\f\r\n\\")  # it reads neither
     marked = ASTTokens(text, tree=tree)
     for node in ast.walk(tree):
         first, last = vars(node)["first_token"], vars(node)["last_token"]

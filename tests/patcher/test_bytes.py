@@ -165,6 +165,14 @@ def test_a_term_in_an_f_string_is_written_in_it(tmp_path):
     assert line.replace("l1_loss", "legs_loss.l1_loss").replace("gt=", "") in plan(root).after["train.py"].decode()
 
 
+def test_brackets_around_a_function_passed_by_name_stay(tmp_path):
+    texts, path = files("registered_callable_weighted"), "src/Methods/GaussianThing/Loss.py"
+    before, name = '"L1_Color", (  # é\n            ', "torch.nn.functional.l1_loss"
+    texts[path] = texts[path].replace(f'"L1_Color", {name}', f"{before}{name})")
+    after = plan(checkout(tmp_path, texts)).after[path].decode()
+    assert f"{before}lambda input, target: legs_loss.l1_loss(input, target, own={name}))" in after
+
+
 def test_a_file_with_a_term_in_another_is_left_with_the_reason(tmp_path, capsys):
     line = "Ll1 = l1_loss(image + l1_loss(image, gt_image), gt_image)"
     root = checkout(tmp_path, {**files("inria"), "train.py": ONE_FILE.replace("SITE", line)})

@@ -37,7 +37,7 @@ class PassedByName(Form):
         assert self.callee is not None
         function = f"{PACKAGE}.l1_loss"
         if self.makes != "mean":
-            function = f"lambda input, target: {function}(input, target, own={code(self.callee, True)})"
+            function = f"lambda input, target: {function}(input, target, own={code(self.callee)})"
         return [text.replace(*text.span(self.node), function)]
 
 

@@ -66,6 +66,7 @@ CASES = {
         "def f():\n" + "".join(f"    def f{i}(a, b):\n        return l1_loss(a, b)\n\n" for i in range(5000)),
         "",
     ),
+    "3,000 terms that nothing trains": ("def step(image, gt):\n" + "    l1_loss(image, gt).backward\n" * 3000, ""),
     "a double byte order mark": ("\ufeff\ufeffl1_loss(a, b)", "does not parse"),
 }
 

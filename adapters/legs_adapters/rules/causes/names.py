@@ -89,7 +89,8 @@ class OtherName(Rule):
         """Return the first name that has one of the words, unless both sides are proven."""
         module = term.function.module
         names = [(name, decider) for name, decider in term.names_around if not SPLATS.search(name)]
-        names += [] if "gaussian" in module.text.lower() else [(module.path.rpartition("/")[2], header(term.function))]
+        file = [(module.path.rpartition("/")[2], header(term.function))]
+        names += file if self.words & {*words(file[0][0])} and "gaussian" not in module.text.lower() else []
         found = [decider for name, decider in names if self.words & set(words(name))][:1]
         return [] if found and term.pair.is_proven and self._is_outweighed(term) else found
 

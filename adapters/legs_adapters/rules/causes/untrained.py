@@ -73,10 +73,9 @@ class Untrained(Rule):
 
         A gradient that is cut of it, ``error = l1_loss(image, gt).detach()``, makes a weight or a number.
         """
-        program, training, function = term.analysis.program, term.analysis.training, term.function
-        cuts = [call for call in function.flow.calls if call_name(call) in ENDS_GRADIENT]
-        is_cut = any(term.form.node in attribute_chain(call) for call in cuts)
-        return not is_cut and not training.touches(function) and _may_run(program, function, 3)
+        analysis, function, calls = term.analysis, term.function, term.function.flow.calls_of
+        is_cut = any(term.form.node in attribute_chain(cut) for name in ENDS_GRADIENT for cut in calls.get(name, ()))
+        return not is_cut and not analysis.training.touches(function) and _may_run(analysis.program, function, 3)
 
 
 UNTRAINED = (Scoring(), Evaluation(), Untrained())

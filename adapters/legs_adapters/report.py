@@ -119,5 +119,5 @@ def as_diff(changes: Changes) -> str:
 
 
 def _lines(data: Optional[bytes]) -> List[str]:
-    """Return the lines of a file, each with "\\n"; splitlines() would also split at form feeds."""
-    return list(io.StringIO((data or b"").decode("utf-8-sig", "replace"), newline=None))
+    """Return the lines of a file as they end there; splitlines() would also split at form feeds."""
+    return list(io.StringIO((data or b"").decode("utf-8", "replace"), newline="\n"))

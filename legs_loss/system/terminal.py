@@ -7,8 +7,8 @@ import re
 import sys
 from typing import Any, Optional, TextIO
 
-# Control characters but tab and line feed; the marks that turn the direction of text, and halves of characters.
-_OBEYED = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+# Control characters but tab and the end of a line; the marks that turn the direction of text, and halves of characters.
+_OBEYED = re.compile("(?!\r\n)[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def printable(text: str, lines: bool = False) -> str:
@@ -23,7 +23,7 @@ def printable(text: str, lines: bool = False) -> str:
         train\x1b[2J\nall is well.py
     """
     shown = _OBEYED.sub(lambda found: ascii(found.group())[1:-1], text)
-    return shown if lines else shown.replace("\n", "\\n")
+    return shown if lines else shown.replace("\r\n", "\\r\\n").replace("\n", "\\n")
 
 
 def say(text: object, stream: Optional[TextIO] = None, end: str = "\n", lines: bool = False) -> None:

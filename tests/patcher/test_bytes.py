@@ -10,9 +10,11 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from legs_adapters.cli import main
 from legs_adapters.plan import plan, write
+from legs_adapters.report import as_diff
 from legs_adapters.undo import undo
 
-from tests.patcher.support import NAMES, PATCHED, SITE, checkout, expected, files, snapshot
+from legs_loss.system.terminal import printable
+from tests.patcher.support import NAMES, PATCHED, SITE, checkout, expected, files, run_git, snapshot
 
 ONE_FILE = textwrap.dedent(
     """\
@@ -74,6 +76,17 @@ def test_bytes_that_are_not_the_edit_stay(change, tmp_path):
     write(found)
     undo(root)
     assert (root / "train.py").read_bytes() == data
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_git_applies_the_diff_whatever_ends_the_lines(end, mark, tmp_path):
+    data = (mark + ONE_FILE.replace("        SITE\n", SITE)).replace("\n", end).encode("utf-8")
+    root = checkout(tmp_path / "root", {**files("inria"), "train.py": data})
+    found = plan(root)
+    (tmp_path / "diff").write_bytes(printable(as_diff(found.changes()), lines=True).encode("utf-8"))
+    run_git(root, "apply", "--whitespace=nowarn", str(tmp_path / "diff"))
+    assert (root / "train.py").read_bytes() == found.after["train.py"] != data
 
 
 SPACES = st.sampled_from(["", " ", "  ", "\n                ", "  # why\n            ", " \\\n            "])

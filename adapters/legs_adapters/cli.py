@@ -283,7 +283,7 @@ def _quote(terms: Sequence[Problem], what: str, more: Sequence[str] = ()) -> Non
 
 def _site(root: Path, text: str) -> Tuple[str, int]:
     name, _, line = text.rpartition(":")
-    if not name or not line.isdigit():
+    if not name or not line.isdecimal() or len(line) > 9:
         raise LegsError(f"--site must be FILE:LINE, got {text!r}")
     for base in (root, Path.cwd()):
         full = Path(os.path.abspath(str(base / name)))

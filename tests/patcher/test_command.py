@@ -392,6 +392,8 @@ class TestCommandLine:
             (["empty"], "no photometric L1 term was found"),
             (["empty", "--undo"], "nothing to undo"),
             (["empty", "--site", "train.py"], "--site must be FILE:LINE"),
+            (["empty", "--site", "train.py:²"], "--site must be FILE:LINE"),
+            (["empty", "--site", "train.py:" + "9" * 5000], "--site must be FILE:LINE"),
         ],
     )
     def test_bad_usage_is_one_line(self, arguments, message, tmp_path, run, monkeypatch):

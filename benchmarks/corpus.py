@@ -149,15 +149,14 @@ def _ablated(folder: str, limit: float) -> Plan:
 
 def masks_in(plans: Dict[str, Plan]) -> str:
     """Count what `legs-patch --masks` does: terms, lines, and the checkouts in which no line is left to the user."""
-    sites = [site for found in plans.values() for site in found.get("sites", ())]
-    lines = sum(site.get("term") == "mask" for site in sites)
+    terms = [site.get("term") for found in plans.values() for site in found.get("sites", ())]
     by_hand = [
         sum(problem["reason"].startswith("not masked") for problem in found.get("problems", ()))
         for found in plans.values()
     ]
     return (
-        f"terms weighted: {len(sites) - lines}; lines that mask them: {lines} written, {sum(by_hand)} left to the "
-        f"user; checkouts in which all are written: {by_hand.count(0)} of {len(plans)}"
+        f"terms weighted: {terms.count(None)}; lines that mask them: {terms.count('mask')} written, {sum(by_hand)} "
+        f"left to the user; checkouts in which all are written: {by_hand.count(0)} of {len(plans)}"
     )
 
 

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Optional
 
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
 from torch import Tensor
 
 from examples.reproduce_paper.schedule import arguments, settings
@@ -35,6 +34,13 @@ from legs_loss.lab.training.metrics import mean_scores, psnr, strongest
 from legs_loss.lab.training.perceptual import has_lpips, lpips
 from legs_loss.scenes import Scene, read_scene
 from legs_loss.system.files import write_whole
+
+try:
+    from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
+except ImportError as error:
+    raise SystemExit(
+        f"schedule_gpu draws with 3DGS's CUDA rasterizer, branch 3dgs_accel: install it first ({error})"
+    ) from None
 
 NEAR, FAR = 0.01, 100.0  # 3DGS's clipping planes
 PATIENCE = 600.0  # seconds to wait for another arm's numbers

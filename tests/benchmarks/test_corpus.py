@@ -122,6 +122,11 @@ def test_masks_are_counted(trees: Path, tmp_path: Path) -> None:
     assert [site.get("term") for site in sites] == [None, "mask"]
 
 
+def test_an_ssim_is_no_weighted_term() -> None:
+    plan = {"sites": [{"file": "train.py"}, {"term": "ssim"}, {"term": "mask"}]}
+    assert corpus.masks_in({"splats": plan}).startswith("terms weighted: 1; lines that mask them: 1 written")
+
+
 def test_another_order_is_a_difference(capsys: pytest.CaptureFixture[str]) -> None:
     assert corpus.compare({"a": {"left": [1, 2]}}, {"a": {"left": [2, 1]}}) == 1
     assert capsys.readouterr().out.splitlines() == ["a", "  left: the same elements in another order"]

@@ -219,15 +219,16 @@ def test_ctrl_c_and_kill_9_lose_nothing_that_matters(tiny_scene: Path, tmp_path:
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
-def test_missing_numba_is_one_clear_error(tiny_scene: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("command", "extra"), [("train", "cpu"), ("demo", "report")])  # with all that it needs
+def test_missing_numba_is_one_clear_error(command: str, extra: str, tiny_scene: Path, tmp_path: Path) -> None:
     (tmp_path / "numba.py").write_text("raise ImportError('no numba here')\n")
     env = environment()
     env["PYTHONPATH"] = os.pathsep.join([str(tmp_path), env["PYTHONPATH"]])
     failed = subprocess.run(
-        arguments_of("train", tiny_scene, "--out", tmp_path / "run"), env=env, capture_output=True, text=True
+        arguments_of(command, tiny_scene, "--out", tmp_path / "run"), env=env, capture_output=True, text=True
     )
     assert failed.returncode == 2
-    assert "pip install numba, or, in the checkout of legs-loss, pip install '.[cpu]'" in failed.stderr
+    assert f"pip install numba, or, in the checkout of legs-loss, pip install '.[{extra}]'" in failed.stderr
     assert "Traceback" not in failed.stderr
 
 

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     """Make or read the scene, precompute, train, print the table and save the pictures."""
     from legs_loss.cli.shared.checks import check_writable
     from legs_loss.errors import LegsError, require
-    from legs_loss.lab.commands.train import progress_bar, set_threads
+    from legs_loss.lab.commands.train import progress_bar
     from legs_loss.lab.embedded import write_embedded_scene
     from legs_loss.lab.training.checkpoint import CHECKPOINT, write_json
     from legs_loss.lab.training.side_by_side import Arm, train_side_by_side
@@ -52,8 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from legs_loss.spec import PRESETS
 
     started = time.perf_counter()
-    set_threads(None)  # fail now if numba is missing
-    require("legs demo", "report", "matplotlib")
+    require("legs demo", "report", "numba", "matplotlib")
     if args.processes < 1:
         raise LegsError(f"--processes must be at least 1, got {args.processes}")
     out: Path = args.out

@@ -131,6 +131,15 @@ class TestWhichTerm:
         assert [(each["file"], each["line"]) for each in report["problems"]] == [line]
         assert "serves other terms of the trace, too" in done.stderr
 
+    @pytest.mark.skipif(sys.version_info < (3, 11), reason="a stack has no columns")
+    def test_of_a_line_of_two_the_one_that_ran_is_weighted(self, tmp_path):
+        lines = body(
+            'drawn, normals, factor = splats.draw(camera), camera.values["normals"], 0.0',
+            'loss = F.l1_loss(drawn["normal"], normals) if factor else F.l1_loss(drawn["rgb"], gt_image)  # <- here',
+        )
+        report, line, _ = traced(tmp_path, lines)
+        assert weighted(report) == [line] and report["sites"][0]["code"] == 'F.l1_loss(drawn["rgb"], gt_image)'
+
     def test_tracking_and_mapping_through_one_function(self, tmp_path):
         train = """
         def compare(a, b):

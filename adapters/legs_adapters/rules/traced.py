@@ -16,7 +16,7 @@ from legs_adapters.terms.kinds.callback import PassedByName
 from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.traced import Frame, Trace, Traced
 
-_Place = Tuple[str, int]
+_Place = Tuple[str, int, int]
 
 
 class _Candidate(NamedTuple):
@@ -29,8 +29,9 @@ class _Candidate(NamedTuple):
 
     @property
     def key(self) -> _Place:
-        """The path and line of its beginning."""
-        return self.function.module.path, self.function.place(self.form.node).line
+        """The path, line and column of its beginning."""
+        place = self.function.place(self.form.node)
+        return self.function.module.path, place.line, place.column
 
 
 def with_trace(found: Findings, analysis: Analysis, trace: Trace) -> Findings:
@@ -48,11 +49,11 @@ class _Join:
         self.settled: Set[_Place] = set()
 
     def run(self) -> Findings:
-        for traced, stack in self.stacks:
+        for traced, stack in sorted(self.stacks, key=lambda each: not each[0].is_photometric):
             if traced.is_photometric:
-                self._photometric(traced, stack)
-        for traced, stack in self.stacks:
-            if not traced.is_photometric:
+                self.entries += self._verdict(traced, stack)
+                self.settled.update(candidate.key for candidate in stack)
+            else:
                 self._other(traced, stack)
         is_known = any(term.is_photometric for term in self.trace.terms)
         for traced in self.trace.terms:
@@ -65,53 +66,56 @@ class _Join:
             kept[name] = [entry for entry in getattr(self.found, name) if not self._is_decided(entry)]
         ran = self.settled.union(candidate.key for _, stack in self.stacks for candidate in stack)
         more = {name: [entry for entry in self.entries if isinstance(entry, kinds[name])] for name in kinds}
-        return self.found._replace(**kept, trace=self.trace, ran=frozenset(ran)).with_more(**more)
+        return self.found._replace(**kept, trace=self.trace, ran=frozenset(key[:2] for key in ran)).with_more(**more)
 
     def _is_decided(self, entry: Any) -> bool:
-        return (entry.path, entry.line) in self.settled and not (isinstance(entry, Site) and entry.form.term)
+        if isinstance(entry, Site):
+            return entry[:3] in self.settled and not entry.form.term
+        return entry[:2] in {key[:2] for key in self.settled}
 
     # -- the forms on a stack
 
     def _candidates(self, traced: Traced) -> Iterator[_Candidate]:
         """Yield the forms on a stack whose arguments are the pair, innermost first."""
-        inner: Optional[Frame] = None
         for depth, frame in enumerate(traced.frames):
             function = self._function(frame)
-            form = self._form(function, frame.line, inner) if function is not None else None
-            if function is not None and form is not None and (inner is None or self._leads_to(form, inner)):
-                target = traced.target if inner is None else self._target_of(traced, inner)
+            form = self._form(function, traced, depth) if function is not None else None
+            if function is not None and form is not None:
+                target = self._target_of(traced, traced.frames[depth - 1]) if depth else traced.target
                 yield _Candidate(function, form, depth, target)
-            inner = frame
 
     def _function(self, frame: Frame) -> Optional[Function]:
-        """Return the function of a frame; of a comprehension the one that it stands in."""
+        """Return the function of a frame; of a lambda or a comprehension the innermost one that it stands in."""
         module = self.analysis.program.module(frame.path)
-        if module is None:
-            return None
-        if frame.name == "<module>":
-            return module.top
-        is_any, scopes = frame.name.startswith("<"), module.scopes(lambda _: True)
-        named = [scope for scope in scopes if scope is not module.top and (is_any or scope.name == frame.name)]
-        before = [scope for scope in named if scope.place(scope.node).line <= frame.line]
-        return max(before, key=lambda scope: scope.place(scope.node).line, default=None)
+        is_any, scopes = frame.name.startswith("<"), module.scopes(lambda _: True) if module is not None else ()
+        named = (scope for scope in scopes if is_any or scope.name == frame.name)
+        return next(reversed([each for each in named if each.parent is None or _on(each, each.node, frame)]), None)
 
-    def _form(self, function: Function, line: int, inner: Optional[Frame]) -> Optional[Form]:
-        for form in self.analysis.forms.in_function(function):
-            if any(_on(function, node, line) for node in (form.node, getattr(form, "difference", None)) if node):
-                return form
-        for call in function.flow.calls if inner is not None and self._is_pair(inner) else ():
+    def _form(self, function: Function, traced: Traced, depth: int) -> Optional[Form]:
+        """Return the form that a frame was at, an L1 or else a call of two pictures; None where it may be another."""
+        forms = self.analysis.forms.in_function(function)
+        found = [form for form in forms if self._is_at(function, form, traced, depth)]
+        for call in function.flow.calls if not found and depth and self._is_pair(traced.frames[depth - 1]) else ():
             values, keywords, starred = arguments(call)
-            if _on(function, call, line) and len(values) == 2 and not (keywords or starred):
-                return Called(call, call, values[0], values[1], call.func)
-        return None
+            if len(values) == 2 and not (keywords or starred):
+                form = Called(call, call, values[0], values[1], call.func)
+                found += [form] if self._is_at(function, form, traced, depth) else []
+        return found[0] if len(found) == 1 or (found and traced.frames[depth].span) else None
+
+    def _is_at(self, function: Function, form: Form, traced: Traced, depth: int) -> bool:
+        """Return whether a frame was at a form, or at the difference that one has elsewhere, and at no argument."""
+        frame, nodes = traced.frames[depth], (form.node, getattr(form, "difference", None))
+        is_on = any(_on(function, node, frame) for node in nodes if node)
+        if not frame.span:
+            return is_on and (depth == 0 or self._leads_to(form, traced.frames[depth - 1]))
+        inside = (form.first, form.second, *(arg.value for arg in form.extras))
+        return is_on and not any(_on(function, node, frame) for node in inside)
 
     def _leads_to(self, form: Form, inner: Frame) -> bool:
-        """Return whether a form's own call led to a frame, and not a call in its arguments, as `render(camera)`."""
+        """Return whether a form's own call led to a frame, and no call in its arguments, as `render(camera)`."""
         inside = (node for side in (form.first, form.second) for node in walk_expressions(side))
-        within = {call_name(node) for node in inside if isinstance(node, ast.Call)}
-        if inner.name in ("forward", "__call__"):
-            return not within or self._is_pair(inner)
-        return inner.name not in within or inner.name == call_name(form.call)
+        has_calls = any(isinstance(node, ast.Call) for node in inside)
+        return not has_calls or self._is_pair(inner) or inner.name == call_name(form.call)
 
     def _is_pair(self, frame: Frame) -> bool:
         """Return whether the first two parameters of a frame's function are the two sides."""
@@ -128,16 +132,14 @@ class _Join:
 
     # -- verdicts
 
-    def _photometric(self, traced: Traced, stack: List[_Candidate]) -> None:
-        """Weight a term at the innermost form that serves no other one; the body of an own L1 function comes last."""
-        self.entries += self._verdict(traced, stack)
-        self.settled.update(candidate.key for candidate in stack)
-
     def _verdict(self, traced: Traced, stack: List[_Candidate]) -> List[Any]:
-        """Return what becomes of a photometric term; nothing where another one has settled it."""
+        """Return what becomes of a photometric term; nothing where another one has settled it.
+
+        It is weighted at the innermost form that serves no other one; the body of an own L1 function comes last.
+        """
         read = next((site for site in self.found.sites if self._is_passed_on(site, traced)), None)
         if read is not None:
-            self.settled.add((read.path, read.line))
+            self.settled.add(read[:3])
             return [read._replace(why=traced.text(self._name(traced, stack)))]
         own = [c for c in stack if (c.function.module.path, c.function.name) not in self.trace.scripted]
         is_read = any(self.analysis.training.scores(candidate.form.node) for candidate in own)
@@ -145,7 +147,7 @@ class _Join:
             uses = self._others(candidate)
             if uses is not None:
                 return [] if candidate.key in self.settled else [self._weighted(traced, candidate, uses)]
-        why = "serves other terms of the trace, too" if own else "no call or difference of the two pictures is there"
+        why = "serves other terms of the trace, too" if own else "no call or difference of them alone is there"
         why = "nothing shows that its gradient is more than read" if is_read else why
         advice = "give the term of the photograph a line of its own, legs_loss.l1_loss(rendering, photograph)"
         return [self._quoted(traced, stack, why, advice, min(own, key=self._is_definition).depth if own else 0)]
@@ -154,8 +156,8 @@ class _Join:
         """Return a form as a site, or as a problem where it cannot be edited."""
         function, form = candidate.function, candidate.form
         place, text = function.place(form.node), traced.text(self._name(traced, [candidate]))
-        sites = [site for site in self.found.sites if not site.form.term and (site.path, site.line) == candidate.key]
-        read = next((site for site in sites if site.column == place.column), None)
+        sites = (site for site in self.found.sites if not site.form.term)
+        read = next((site for site in sites if site[:3] == candidate.key), None)
         verdict: Any = read or self.verdicts.decide(function, form, place, True)
         if isinstance(verdict, Problem):
             return verdict._replace(reason=f"{text}; {verdict.reason}")
@@ -187,25 +189,26 @@ class _Join:
         if not isinstance(form, PassedByName) or form.caller is None:
             return False
         caller, call = form.caller, form.call
-        return any(frame.path == caller.module.path and _on(caller, call, frame.line) for frame in traced.frames)
+        return any(_on(caller, call, frame) for frame in traced.frames)
 
     def _others(self, candidate: _Candidate) -> Optional[List[Use]]:
         """Return the calls that lead other terms through a form; None where they cannot be told from the loss's."""
-        through = [(traced, c.depth) for traced, stack in self.stacks for c in stack if c.key == candidate.key]
-        losses = {frame[:2] for traced, _ in through if traced.is_photometric for frame in traced.frames}
+        steps = [(term, depth) for term, _ in self.stacks for depth in range(len(term.frames))]
+        through = [step for step in steps if self._is_at(candidate.function, candidate.form, *step)]
+        losses = [frame[:3] for traced, _ in through if traced.is_photometric for frame in traced.frames]
         uses = [self._use(*each, candidate, losses) for each in through if not each[0].is_photometric]
         known = [use for use in uses if use is not None]
         return known if len(known) == len(uses) else None
 
-    def _use(self, traced: Traced, depth: int, candidate: _Candidate, losses: Set[_Place]) -> Optional[Use]:
+    def _use(self, traced: Traced, depth: int, candidate: _Candidate, losses: List[Any]) -> Optional[Use]:
         """Return the call that led a term into the function of a form, and no photometric one."""
         for frame in traced.frames[depth + 1 : depth + 2]:
             caller = self._function(frame)
-            if caller is not None and frame[:2] not in losses:
-                calls = [call for call in caller.flow.calls if _on(caller, call, frame.line)]
+            if caller is not None and frame[:3] not in losses:
+                calls = (call for call in caller.flow.calls if _on(caller, call, frame))
+                named = (call for call in calls if call_name(call) == candidate.function.name)
                 why = Evidence("", traced.text(self._name(traced, [])), ())
-                uses = [Use(caller, call, why, True) for call in calls if call_name(call) == candidate.function.name]
-                return next(iter(uses), None)
+                return next((Use(caller, call, why, True) for call in named), None)
         return None
 
     def _other(self, traced: Traced, stack: List[_Candidate]) -> None:
@@ -218,11 +221,11 @@ class _Join:
             is_said = traced.kind not in ("l1", "signed") and not traced.why_other
             if is_said and here.path in self.analysis.program.sources:
                 self.entries.append(Left(*here, traced.text(self._name(traced, [])), (here,)))
-                self.settled.add((here.path, here.line))
+                self.settled.add((here.path, here.line, -1))
             return
         candidate = own[0]
         place, text = candidate.function.place(candidate.form.node), traced.text(self._name(traced, [candidate]))
-        is_left = any((entry.path, entry.line) == candidate.key for entry in self.found.left)
+        is_left = any(entry[:2] == candidate.key[:2] for entry in self.found.left)
         if traced.is_unknown and not is_left:
             term = Term(self.analysis, candidate.function, candidate.form)
             self.entries.append(self.verdicts.problem(term, place, text))
@@ -234,19 +237,21 @@ class _Join:
     @staticmethod
     def _differs(candidate: _Candidate, read: Sequence[Any], said: str) -> str:
         """Return in words that reading said otherwise, where a line is among what it found."""
-        differs = any((entry.path, entry.line) == candidate.key for entry in read)
+        differs = any(entry[:2] == candidate.key[:2] for entry in read)
         return f"; by reading it would be {said}" if differs else ""
 
     @staticmethod
     def _name(traced: Traced, stack: List[_Candidate]) -> str:
         """Return what the side that wants no gradient is called where a term stands."""
-        for candidate in stack:
-            if candidate.target >= 0:
-                return one_line((candidate.form.first, candidate.form.second)[candidate.target])
-        names = [frame.sides[traced.target] for frame in traced.frames if traced.target >= 0]
-        return next((name for name in reversed(names) if name), "")
+        sides = [((each.form.first, each.form.second)[each.target]) for each in stack if each.target >= 0]
+        names = [frame.sides[traced.target] for frame in reversed(traced.frames) if traced.target >= 0]
+        return next((name for name in (*map(one_line, sides), *names) if name), "")
 
 
-def _on(function: Function, node: ast.AST, line: int) -> bool:
-    place = function.place(node)
-    return place.line <= line <= place.last_line
+def _on(function: Function, node: ast.AST, frame: Frame) -> bool:
+    """Return whether what a frame was at lies in a node: before Python 3.11 whether its line does."""
+    place, start = function.place(node), function.module.lines.start
+    if frame.path != function.module.path or not frame.span:
+        return frame.path == function.module.path and place.line <= frame.line <= place.last_line
+    last_line, first, last = frame.span
+    return place.start <= start(frame.line) + first and start(last_line) + last <= place.end

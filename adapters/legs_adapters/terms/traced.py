@@ -6,10 +6,14 @@ from typing import Any, Dict, FrozenSet, List, NamedTuple, Optional, Sequence, T
 
 
 class Frame(NamedTuple):
-    """A line of the checkout on a difference's stack, in which function, and its names of the two sides, or ""."""
+    """A place of the checkout on a difference's stack, in which function, and its names of the two sides, or "".
+
+    ``span`` is the last line, and the first and last column in bytes, of the expression; empty before Python 3.11.
+    """
 
     path: str
     line: int
+    span: Sequence[int]
     name: str
     sides: Tuple[str, ...]
 
@@ -103,16 +107,12 @@ class Traced(NamedTuple):
 
     def text(self, target: str) -> str:
         """Return what was seen, in words; ``target`` is the name of the side that wants no gradient."""
-        parts = [f"{100 * self.share:.0f}% of the loss"]
         why = self.why_other
-        if why:
-            parts.append(why.format(target=target or "the other side"))
-        else:
-            assert self.match is not None
-            parts.append(f"{target or 'the other side'} is {self.match['path']}")
+        what = why or "{target} is " + (self.match or {})["path"]
+        parts = [f"{100 * self.share:.0f}% of the loss", what.replace("{target}", target or "the other side")]
         if not self.is_l1:
-            what = {"robust": "a Huber, Charbonnier or other bent loss", "signed": "a signed difference"}
-            parts.append(f"{what.get(self.kind, f'a {self.kind} loss')}, no L1")
+            kinds = {"robust": "a Huber, Charbonnier or other bent loss", "signed": "a signed difference"}
+            parts.append(f"{kinds.get(self.kind, f'a {self.kind} loss')}, no L1")
         elif not why and self.gaussians:
             parts.append(f"{self.gaussians:,} Gaussians are stepped after it")
         elif not why:

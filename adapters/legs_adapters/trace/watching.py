@@ -7,6 +7,7 @@ graph does. Nothing of a backward pass is kept after it but numbers, and weak re
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 import sys
 import time
@@ -37,7 +38,7 @@ _OWNERS: Sequence[Tuple[Any, Sequence[str], str]] = (  # where torch has each; a
 )
 _SIDES = ("input", "other", "prediction", "target")  # their names, given by name
 
-Frame = Tuple[str, int, str, Tuple[str, ...]]
+Frame = Tuple[str, int, Tuple[int, ...], str, Tuple[str, ...]]
 
 
 def _harmless(own: Any) -> Any:
@@ -211,7 +212,7 @@ class Watch:
         while frame is not None:
             path, module = self._inside_root(frame.f_code.co_filename), frame.f_globals.get("__name__", "")
             if path is not None:
-                found.append((path, frame.f_lineno, frame.f_code.co_name, _names(frame, sides)))
+                found.append((path, frame.f_lineno, _span(frame), frame.f_code.co_name, _names(frame, sides)))
             elif not found and module.startswith(_OWN) and not module.startswith(legs_loss.runtime.__name__):
                 return ()  # a shim's, or one of another loss (the run time's `unweighted` calls the script's)
             frame = frame.f_back
@@ -277,8 +278,7 @@ class Watch:
         self.terms.setdefault(key, {
             "frames": record.frames, "kind": kind, "target": record.target, "shape": list(record.still.shape),
             "is_picture": picture is not None, "match": match and match._asdict(), "is_known": known is not None,
-            "is_rival": False,
-            "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
+            "is_rival": False, "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
         })  # fmt: skip
         return key, match, as_planes(record.still) if whole is None else whole
 
@@ -340,6 +340,13 @@ def _share(shares: List[Any], values: Any, _: Any, gradients: Sequence[Any]) -> 
     """Add what a difference contributes to the loss: an L1 is the sum of its gradient times its values."""
     if gradients and gradients[0] is not None and gradients[0].shape == values.shape:
         shares.append((gradients[0].detach().float() * values.float()).sum())
+
+
+def _span(frame: Any) -> Tuple[int, ...]:
+    """Return the last line, the first and last column of the expression that a frame is at; not before Python 3.11."""
+    positions = frame.f_code.co_positions() if hasattr(frame.f_code, "co_positions") else ()
+    line, *span = next(itertools.islice(positions, frame.f_lasti // 2, None), (None,))
+    return tuple(span) if line == frame.f_lineno and None not in span else ()
 
 
 def _names(frame: Any, sides: Sequence[Any]) -> Tuple[str, ...]:

@@ -11,7 +11,7 @@ from legs_loss.autograd import is_compiling, is_transformed
 from legs_loss.errors import LegsError
 
 # A rendering may overshoot 1 and an HDR photograph may exceed it; 8-bit values are far larger.
-_SURELY_NOT_UNIT_RANGE = 16.0
+SURELY_NOT_UNIT_RANGE = 16.0
 _LARGEST_WEIGHT = 1e6  # float32 overflows in the sum over an image of larger ones
 _CHANNELS = (1, 3, 4)  # of a photograph: gray, colour, colour and alpha; a rendering may have any number
 
@@ -171,6 +171,6 @@ def check_values(image: Tensor, name: str = "target") -> None:
     if largest != largest or largest == float("inf"):
         why = "a weight map cannot be made from it; look at how this view is loaded"
         raise LegsError(f"{name} {shape_of(image)} has values that are NaN or infinite: {why}")
-    if largest > _SURELY_NOT_UNIT_RANGE:
+    if largest > SURELY_NOT_UNIT_RANGE:
         what = f"{name} {shape_of(image)} has values up to {largest:g}"
         raise LegsError(f"{what}: images are in [0, 1] here (8-bit images: image / 255.0)")

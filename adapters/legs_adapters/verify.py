@@ -145,7 +145,7 @@ def verify(
             if not runs["unpatched"].losses:
                 return Verdict(runs, {"the unpatched script trained": False})
     claims = _claims(runs)
-    return Verdict(runs, claims if by_hand else {**claims, **_of_terms(Traced.read(runs["patched"].terms))})
+    return Verdict(runs, claims if by_hand else {**claims, **_of_terms(list(Traced.read(runs["patched"].terms)))})
 
 
 def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:

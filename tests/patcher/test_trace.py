@@ -220,7 +220,7 @@ class TestWaysToTrain:
         report, line, done = traced(tmp_path, UNSEEN)
         assert weighted(report) == []
         fused = [each["reason"] for each in report["left"] if each["line"] == line[1]]
-        assert len(fused) == 1 and "a compiled: Fused loss, no L1" in fused[0]
+        assert len(fused) == 1 and "compiled: Fused, not looked into" in fused[0]
         assert "a trace cannot look into fused kernels, as these under the loss: FusedBackward" in done.stderr
 
     def test_nothing_of_a_step_is_kept(self, tmp_path):

@@ -33,9 +33,9 @@ def at(code, expression, name="step", sides=("", "")):
     return Frame("train.py", line, (last, begin, end), name, sides)
 
 
-def term(*frames, match=PHOTOGRAPH, kind="l1"):
+def term(*frames, match=PHOTOGRAPH, kind="l1", largest=1.0):
     """Return a term with a stack, whose second side is a photograph, or what another match says."""
-    return Traced(frames, kind, 1, (3, 32, 48), 0.5, match, True, False, 300, (), (), 8, 0, True)
+    return Traced(frames, kind, 1, (3, 32, 48), largest, 0.5, match, True, False, 300, (), (), 8, 0, True)
 
 
 def found(folder, step, *stacks, columns=True):
@@ -122,3 +122,23 @@ def test_without_columns_a_line_of_one_is_weighted(tmp_path):
 def test_braces_in_the_name_of_a_file_are_said_as_they_are():
     assert "gt is images/{0}.png" in term(at("a - b", "a - b")).text("gt")
     assert "gt is normals/{0}.png, no photograph" in term(at("a - b", "a - b"), match=NORMALS).text("gt")
+
+
+def test_a_photograph_that_legs_loss_would_refuse_is_quoted(tmp_path):
+    frame, step = at("l1_loss(image, gt)", "l1_loss(image, gt)"), "def step(image, gt):\n    loss = l1_loss(image, gt)"
+    (tmp_path / "train.py").write_text(f"{step}{END}", encoding="utf-8")
+    trace = Trace([term(frame._replace(line=2, span=(2, 11, 29)), largest=241.0)], frozenset())
+    findings = plan(tmp_path, trace=trace).findings
+    assert findings.sites == [] and "its values go up to 241: divide both pictures" in findings.problems[0].reason
+
+
+def test_a_function_that_is_not_looked_into_is_not_said_to_be_no_l1():
+    text = term(at("a - b", "a - b"), kind="compiled: Fused").text("gt")
+    assert text.endswith("compiled: Fused, not looked into")
+
+
+def test_one_line_that_two_ways_lead_to_is_quoted_once(tmp_path):
+    step = "\n    loss = step(image)(*[image, gt])"
+    stacks = [("l1", PHOTOGRAPH, "step(image)(*[image, gt])", way) for way in ("mae", "mse_loss")]
+    sites, problems, _ = found(tmp_path, step, *stacks)
+    assert sites == [] and len(problems) == 1

@@ -15,6 +15,7 @@ from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import PassedByName
 from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.traced import Frame, Trace, Traced
+from legs_loss.images import SURELY_NOT_UNIT_RANGE
 
 _Place = Tuple[str, int, int]
 
@@ -51,7 +52,7 @@ class _Join:
     def run(self) -> Findings:
         for traced, stack in sorted(self.stacks, key=lambda each: not each[0].is_photometric):
             if traced.is_photometric:
-                self.entries += self._verdict(traced, stack)
+                self.entries += [entry for entry in self._verdict(traced, stack) if entry not in self.entries]
                 self.settled.update(candidate.key for candidate in stack)
             else:
                 self._other(traced, stack)
@@ -93,8 +94,7 @@ class _Join:
 
     def _form(self, function: Function, traced: Traced, depth: int) -> Optional[Form]:
         """Return the form that a frame was at, an L1 or else a call of two pictures; None where it may be another."""
-        forms = self.analysis.forms.in_function(function)
-        found = [form for form in forms if self._is_at(function, form, traced, depth)]
+        found = [one for one in self.analysis.forms.in_function(function) if self._is_at(function, one, traced, depth)]
         for call in function.flow.calls if not found and depth and self._is_pair(traced.frames[depth - 1]) else ():
             values, keywords, starred = arguments(call)
             if len(values) == 2 and not (keywords or starred):
@@ -143,12 +143,14 @@ class _Join:
             return [read._replace(why=traced.text(self._name(traced, stack)))]
         own = [c for c in stack if (c.function.module.path, c.function.name) not in self.trace.scripted]
         is_read = any(self.analysis.training.scores(candidate.form.node) for candidate in own)
-        for candidate in sorted(own, key=self._is_definition) if not is_read else ():
+        why = "nothing shows that its gradient is more than read" if is_read else ""
+        if traced.largest > SURELY_NOT_UNIT_RANGE:  # legs_loss would refuse it in the first step
+            why = f"its values go up to {traced.largest:g}: divide both pictures by 255 before"
+        for candidate in sorted(own, key=self._is_definition) if not why else ():
             uses = self._others(candidate)
             if uses is not None:
                 return [] if candidate.key in self.settled else [self._weighted(traced, candidate, uses)]
-        why = "serves other terms of the trace, too" if own else "no call or difference of them alone is there"
-        why = "nothing shows that its gradient is more than read" if is_read else why
+        why = why or ("serves other terms of the trace, too" if own else "no call or difference of them alone is there")
         advice = "give the term of the photograph a line of its own, legs_loss.l1_loss(rendering, photograph)"
         return [self._quoted(traced, stack, why, advice, min(own, key=self._is_definition).depth if own else 0)]
 
@@ -185,11 +187,8 @@ class _Join:
     @staticmethod
     def _is_passed_on(site: Site, traced: Traced) -> bool:
         """Return whether a site is a function passed by name whose call is on the stack."""
-        form = site.form
-        if not isinstance(form, PassedByName) or form.caller is None:
-            return False
-        caller, call = form.caller, form.call
-        return any(_on(caller, call, frame) for frame in traced.frames)
+        caller = site.form.caller if isinstance(site.form, PassedByName) else None
+        return caller is not None and any(_on(caller, site.form.call, frame) for frame in traced.frames)
 
     def _others(self, candidate: _Candidate) -> Optional[List[Use]]:
         """Return the calls that lead other terms through a form; None where they cannot be told from the loss's."""

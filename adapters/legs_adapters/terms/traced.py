@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, FrozenSet, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Dict, FrozenSet, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 
 class Frame(NamedTuple):
@@ -26,6 +26,7 @@ class Traced(NamedTuple):
         kind: "l1", "squared", "robust", "signed", "compiled: NAME"; of legs_loss.l1_loss "weighted" or "plain".
         target: which operand is the side that wants no gradient; -1: both want one.
         shape: of that side.
+        largest: its largest absolute value.
         share: its part of the loss.
         match: the image file that side is most like: "path", "correlation", "is_photograph"; None: there is no file, or
             the side is no picture of three or four channels.
@@ -42,6 +43,7 @@ class Traced(NamedTuple):
     kind: str
     target: int
     shape: Tuple[int, ...]
+    largest: float
     share: float
     match: Optional[Dict[str, Any]]
     is_known: bool
@@ -54,14 +56,12 @@ class Traced(NamedTuple):
     is_picture: bool
 
     @classmethod
-    def read(cls, terms: Sequence[Dict[str, Any]]) -> List[Traced]:
-        """Return those terms of a watched process's report after which something was stepped."""
-        found = []
+    def read(cls, terms: Sequence[Dict[str, Any]]) -> Iterator[Traced]:
+        """Yield those terms of a watched process's report after which something was stepped."""
         for term in (term for term in terms if term["steps"] or term["poses"]):
             frames = tuple(Frame(*frame) for frame in term["frames"])
             rest = {name: value for name, value in term.items() if name not in ("frames", "shares")}
-            found.append(cls(frames=frames, share=sum(term["shares"]) / max(1, len(term["shares"])), **rest))
-        return found
+            yield cls(frames=frames, share=sum(term["shares"]) / max(1, len(term["shares"])), **rest)
 
     @property
     def is_l1(self) -> bool:
@@ -112,7 +112,8 @@ class Traced(NamedTuple):
         parts = [f"{100 * self.share:.0f}% of the loss", what.replace("{target}", target or "the other side")]
         if not self.is_l1:
             kinds = {"robust": "a Huber, Charbonnier or other bent loss", "signed": "a signed difference"}
-            parts.append(f"{kinds.get(self.kind, f'a {self.kind} loss')}, no L1")
+            known = f"{kinds.get(self.kind, f'a {self.kind} loss')}, no L1"
+            parts.append(f"{self.kind}, not looked into" if ":" in self.kind else known)
         elif not why and self.gaussians:
             parts.append(f"{self.gaussians:,} Gaussians are stepped after it")
         elif not why:

@@ -182,7 +182,8 @@ class Watch:
         def apply(cls: Any, *args: Any, **kwargs: Any) -> Any:
             call = own.__get__(None, cls) if own is not None else super(function, cls).apply  # type: ignore[misc]
             made = call(*args, **kwargs)
-            if not self._inside and getattr(made, "grad_fn", None) is not None:
+            is_torchs = cls.__module__.startswith("torch.")  # a checkpoint, whose differences are watched
+            if not (self._inside or is_torchs) and getattr(made, "grad_fn", None) is not None:
                 pictures = [arg for arg in args if isinstance(arg, torch.Tensor) and arg.dim() > 2]
                 pair = next(((a, b) for a, b in zip(pictures, pictures[1:]) if a.shape == b.shape), None)
                 if pair is not None:
@@ -278,7 +279,8 @@ class Watch:
         self.terms.setdefault(key, {
             "frames": record.frames, "kind": kind, "target": record.target, "shape": list(record.still.shape),
             "is_picture": picture is not None, "match": match and match._asdict(), "is_known": known is not None,
-            "is_rival": False, "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
+            "largest": float(record.still.detach().abs().max()), "is_rival": False, "shares": [], "steps": 0,
+            "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
         })  # fmt: skip
         return key, match, as_planes(record.still) if whole is None else whole
 

@@ -279,8 +279,8 @@ class Watch:
         self.terms.setdefault(key, {
             "frames": record.frames, "kind": kind, "target": record.target, "shape": list(record.still.shape),
             "is_picture": picture is not None, "match": match and match._asdict(), "is_known": known is not None,
-            "largest": float(record.still.detach().abs().max()), "is_rival": False, "shares": [], "steps": 0,
-            "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
+            "largest": 0.0 if picture is None else float(record.still.detach().nan_to_num().abs().max()),
+            "is_rival": False, "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
         })  # fmt: skip
         return key, match, as_planes(record.still) if whole is None else whole
 

@@ -15,7 +15,6 @@ from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import PassedByName
 from legs_adapters.terms.kinds.called import Called
 from legs_adapters.terms.traced import Frame, Trace, Traced
-from legs_loss.images import SURELY_NOT_UNIT_RANGE
 
 _Place = Tuple[str, int, int]
 
@@ -137,6 +136,8 @@ class _Join:
 
         It is weighted at the innermost form that serves no other one; the body of an own L1 function comes last.
         """
+        from legs_loss.images import SURELY_NOT_UNIT_RANGE  # which imports torch: reading alone does without
+
         read = next((site for site in self.found.sites if self._is_passed_on(site, traced)), None)
         if read is not None:
             self.settled.add(read[:3])

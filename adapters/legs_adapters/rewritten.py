@@ -38,13 +38,15 @@ def execute(words: Sequence[str], sources: Dict[str, bytes], cpu_root: Optional[
 
         start(cpu_root)
         passed_on += (MissingShim,)
+    is_module = words[0] == "-m"
+    sys.argv[:] = words[is_module:]
+    if not getattr(sys.flags, "safe_path", False):  # else Python puts no folder there
+        sys.path[0] = os.getcwd() if is_module else os.path.dirname(os.path.realpath(words[0]))
     try:
-        if words[0] == "-m":
-            sys.argv[:], sys.path[0] = words[1:], os.getcwd()
+        if is_module:
             runpy.run_module(words[1], run_name="__main__", alter_sys=True)
         else:
-            sys.argv[:], sys.path[0] = words, os.path.dirname(os.path.realpath(words[0]))
-            _run_main(_as_python_names(words[0]), "__main__")
+            _run_main(_as_python_names(words[0]), "__main__", "__mp_main__")  # what spawned processes send is of both
     except passed_on:
         raise
     except BaseException as error:
@@ -111,10 +113,9 @@ def install(sources: Dict[str, bytes]) -> None:
         return stats(self, path)
 
     def import_main(path: str) -> None:  # as multiprocessing does, which reads the file
-        if getattr(sys.modules["__main__"], "__file__", None) == path:
-            return
-        spawn.old_main_modules.append(sys.modules["__main__"])
-        _run_main(path, "__mp_main__", "__main__")
+        if getattr(sys.modules["__main__"], "__file__", None) != path:
+            spawn.old_main_modules.append(sys.modules["__main__"])
+            _run_main(path, "__mp_main__", "__main__")
 
     loader.get_data, loader.path_stats = get_data, path_stats
     spawn._fixup_main_from_path = import_main
@@ -125,11 +126,10 @@ def call_when_spawned(function: Callable[[Any], None], argument: Any) -> None:
     """Let each process that this one spawns call a module's function before it does anything else."""
     spawn: Any = multiprocessing.spawn
     prepare = spawn.get_preparation_data
-    call = _SpawnedCall(function, argument)
-    spawn.get_preparation_data = lambda name: {**prepare(name), f"legs {function.__name__}": call}
+    spawn.get_preparation_data = lambda name: {**prepare(name), f"legs {function.__name__}": _Call(function, argument)}
 
 
-class _SpawnedCall:
+class _Call:
     """A call that is made where this is unpickled."""
 
     def __init__(self, function: Callable[[Any], None], argument: Any) -> None:

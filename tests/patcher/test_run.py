@@ -145,8 +145,9 @@ class TestAsPythonRunsIt:
             "import sys\nsys.exit(7)\n",
             "import sys\nsys.exit('a message')\n",
             """
-            import __main__, atexit, pickle, sys
+            import __main__, atexit, multiprocessing, pickle, sys
             class A: pass
+            print(sys.modules["__mp_main__"] is __main__)  # by this name a spawned process sends its own A
             print(sys.path[0], sys.argv, __file__, __name__, __doc__, __spec__)
             print(training.__module__, __main__.__file__, __main__.A is A, type(pickle.loads(pickle.dumps(A()))))
             atexit.register(print, 'bye')
@@ -160,6 +161,13 @@ class TestAsPythonRunsIt:
         assert (run.returncode, run.stdout) == (plain.returncode, plain.stdout)
         noise = [line for line in run.stderr.splitlines() if not line.startswith("legs-loss: ")]
         assert noise == plain.stderr.splitlines()
+
+    @pytest.mark.skipif(sys.version_info < (3, 11), reason="without -P")
+    def test_without_the_scripts_folder_the_path_is_as_python_has_it(self, tmp_path):
+        (tmp_path / "plain.py").write_text("import sys\nprint(sys.path)\n", encoding="utf-8")
+        code = "import sys\nfrom legs_adapters.rewritten import execute\nsys.exit(execute(['plain.py'], {}))"
+        run, plain = by_python("-P", "-c", code, cwd=tmp_path), by_python("-P", "plain.py", cwd=tmp_path)
+        assert (run.returncode, run.stdout) == (plain.returncode, plain.stdout), run.stderr
 
     def test_tracebacks_point_at_the_right_lines(self, tmp_path):
         root = self.script(

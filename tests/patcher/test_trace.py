@@ -223,6 +223,14 @@ class TestWaysToTrain:
         assert len(fused) == 1 and "compiled: Fused, not looked into" in fused[0]
         assert "a trace cannot look into fused kernels, as these under the loss: FusedBackward" in done.stderr
 
+    def test_a_distance_is_said(self, tmp_path):
+        report, line, _ = traced(
+            tmp_path, body('loss = torch.dist(splats.draw(camera)["rgb"], gt_image, p=1)  # <- here')
+        )
+        reasons = [each["reason"] for each in report["left"] if each["line"] == line[1]]
+        assert weighted(report) == [] and len(reasons) == 1
+        assert reasons[0].endswith("gt_image is images/000.png; distance: of any norm, not looked into")
+
     def test_nothing_of_a_step_is_kept(self, tmp_path):
         """Tensors alive after each step, by the script's own count; parameters are replaced, one is never stepped."""
         train = body(

@@ -6,6 +6,8 @@ import pytest
 from legs_adapters.plan import plan
 from legs_adapters.terms.traced import Frame, Trace, Traced
 
+from tests.patcher.support import checkout, files
+
 PHOTOGRAPH = {"path": "images/{0}.png", "correlation": 1.0, "is_photograph": True, "detail": 1.0}
 NORMALS = {**PHOTOGRAPH, "path": "normals/{0}.png", "is_photograph": False}
 HEAD = """
@@ -130,6 +132,25 @@ def test_a_photograph_that_legs_loss_would_refuse_is_quoted(tmp_path):
     trace = Trace([term(frame._replace(line=2, span=(2, 11, 29)), largest=241.0)], frozenset())
     findings = plan(tmp_path, trace=trace).findings
     assert findings.sites == [] and "its values go up to 241: divide both pictures" in findings.problems[0].reason
+
+
+@pytest.mark.parametrize("largest", [1.0, 241.0])
+def test_so_is_one_of_a_function_that_is_passed_by_its_name(tmp_path, largest):
+    root = checkout(tmp_path, files("l1_function_as_value_weighted"))
+    call = at((root / "train.py").read_text(encoding="utf-8"), "loss_fn(image, gt_image)", "training")
+    findings = plan(root, trace=Trace([term(call, largest=largest)], frozenset())).findings
+    sites, quoted = (
+        [each.line for each in some if each.path == "train.py"] for some in (findings.sites, findings.problems)
+    )
+    assert (len(sites), quoted) == ((1, []) if largest == 1 else (0, [call.line]))
+
+
+@pytest.mark.parametrize("is_alone", [True, False])
+def test_a_photographs_difference_is_said_where_no_absolute_one_is_seen(tmp_path, is_alone):
+    step = "\n    loss = (image - gt).relu().mean()\n    loss += mae(image, gt)"
+    absolute = ("l1", PHOTOGRAPH, BODY, "mae(image, gt)")
+    _, _, left = found(tmp_path, step, ("signed", PHOTOGRAPH, "image - gt"), *[absolute] * (not is_alone))
+    assert (HEAD.count("\n") + 2 in left) == is_alone
 
 
 def test_a_function_that_is_not_looked_into_is_not_said_to_be_no_l1():

@@ -44,6 +44,7 @@ class _Join:
         self.found, self.analysis, self.trace = found, analysis, trace
         self.verdicts = Verdicts(analysis)
         terms = [term for term in trace.terms if not term.is_patched]
+        self.is_known = any(term.is_photometric for term in trace.terms)
         self.stacks: List[Tuple[Traced, List[_Candidate]]] = [(term, list(self._candidates(term))) for term in terms]
         self.entries: List[Any] = []
         self.settled: Set[_Place] = set()
@@ -55,9 +56,8 @@ class _Join:
                 self.settled.update(candidate.key for candidate in stack)
             else:
                 self._other(traced, stack)
-        is_known = any(term.is_photometric for term in self.trace.terms)
         for traced in self.trace.terms:
-            if traced.kind == "weighted" and not traced.is_photometric and (is_known or not traced.is_unknown):
+            if traced.kind == "weighted" and not traced.is_photometric and (self.is_known or not traced.is_unknown):
                 advice = "write what stood there before: legs-patch --undo has it"
                 self.entries.append(self._quoted(traced, [], "it is weighted", advice))
         kinds = {"sites": Site, "left": Left, "problems": Problem}
@@ -112,8 +112,7 @@ class _Join:
 
     def _leads_to(self, form: Form, inner: Frame) -> bool:
         """Return whether a form's own call led to a frame, and no call in its arguments, as `render(camera)`."""
-        inside = (node for side in (form.first, form.second) for node in walk_expressions(side))
-        has_calls = any(isinstance(node, ast.Call) for node in inside)
+        has_calls = any(isinstance(node, ast.Call) for node in walk_expressions(form.first, form.second))
         return not has_calls or self._is_pair(inner) or inner.name == call_name(form.call)
 
     def _is_pair(self, frame: Frame) -> bool:
@@ -141,12 +140,13 @@ class _Join:
         read = next((site for site in self.found.sites if self._is_passed_on(site, traced)), None)
         if read is not None:
             self.settled.add(read[:3])
-            return [read._replace(why=traced.text(self._name(traced, stack)))]
         own = [c for c in stack if (c.function.module.path, c.function.name) not in self.trace.scripted]
         is_read = any(self.analysis.training.scores(candidate.form.node) for candidate in own)
         why = "nothing shows that its gradient is more than read" if is_read else ""
         if traced.largest > SURELY_NOT_UNIT_RANGE:  # legs_loss would refuse it in the first step
             why = f"its values go up to {traced.largest:g}: divide both pictures by 255 before"
+        elif read is not None:
+            return [read._replace(why=traced.text(self._name(traced, stack)))]
         for candidate in sorted(own, key=self._is_definition) if not why else ():
             uses = self._others(candidate)
             if uses is not None:
@@ -159,8 +159,7 @@ class _Join:
         """Return a form as a site, or as a problem where it cannot be edited."""
         function, form = candidate.function, candidate.form
         place, text = function.place(form.node), traced.text(self._name(traced, [candidate]))
-        sites = (site for site in self.found.sites if not site.form.term)
-        read = next((site for site in sites if site[:3] == candidate.key), None)
+        read = next((site for site in self.found.sites if site[:3] == candidate.key and not site.form.term), None)
         verdict: Any = read or self.verdicts.decide(function, form, place, True)
         if isinstance(verdict, Problem):
             return verdict._replace(reason=f"{text}; {verdict.reason}")
@@ -174,8 +173,7 @@ class _Join:
 
     def _quoted(self, traced: Traced, stack: List[_Candidate], why: str, advice: str, depth: int = 0) -> Problem:
         """Return a line of a term's stack as one that cannot be decided."""
-        reason = f"{traced.text(self._name(traced, stack))}; {why}"
-        return Problem(*self._line(traced.frames[depth]), reason, advice)
+        return Problem(*self._line(traced.frames[depth]), f"{traced.text(self._name(traced, stack))}; {why}", advice)
 
     def _line(self, frame: Frame) -> Line:
         module = self.analysis.program.module(frame.path)
@@ -216,12 +214,12 @@ class _Join:
         own = [candidate for candidate in stack if not self._is_definition(candidate)] or stack
         if any(candidate.key in self.settled for candidate in own):
             return
-        if not stack:  # that of a photograph is said: it is squared, or compiled
+        if not stack:  # that of a photograph is said: it is squared, or compiled; signed where no other is known
             here = self._line(traced.frames[0])
-            is_said = traced.kind not in ("l1", "signed") and not traced.why_other
+            is_said = traced.kind not in ("l1", *["signed"] * self.is_known) and not traced.why_other
             if is_said and here.path in self.analysis.program.sources:
                 self.entries.append(Left(*here, traced.text(self._name(traced, [])), (here,)))
-                self.settled.add((here.path, here.line, -1))
+                self.settled.update([(here.path, here.line, -1)] if traced.kind != "signed" else [])
             return
         candidate = own[0]
         place, text = candidate.function.place(candidate.form.node), traced.text(self._name(traced, [candidate]))

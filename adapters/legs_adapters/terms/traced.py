@@ -23,7 +23,8 @@ class Traced(NamedTuple):
 
     Attributes:
         frames: of the checkout, innermost first.
-        kind: "l1", "squared", "robust", "signed", "compiled: NAME"; of legs_loss.l1_loss "weighted" or "plain".
+        kind: "l1", "squared", "robust", "signed", "compiled: NAME", "distance: of any norm"; of legs_loss.l1_loss
+            "weighted" or "plain".
         target: which operand is the side that wants no gradient; -1: both want one.
         shape: of that side.
         largest: its largest absolute value.
@@ -111,8 +112,8 @@ class Traced(NamedTuple):
         what = why or "{target} is " + (self.match or {})["path"]
         parts = [f"{100 * self.share:.0f}% of the loss", what.replace("{target}", target or "the other side")]
         if not self.is_l1:
-            kinds = {"robust": "a Huber, Charbonnier or other bent loss", "signed": "a signed difference"}
-            known = f"{kinds.get(self.kind, f'a {self.kind} loss')}, no L1"
+            kinds = {"robust": "a Huber, Charbonnier or other bent loss, no L1", "signed": "no absolute value is seen"}
+            known = kinds.get(self.kind, f"a {self.kind} loss, no L1")
             parts.append(f"{self.kind}, not looked into" if ":" in self.kind else known)
         elif not why and self.gaussians:
             parts.append(f"{self.gaussians:,} Gaussians are stepped after it")

@@ -30,8 +30,10 @@ _OWN = ("legs_adapters.", "legs_loss.")
 _OWNERS: Sequence[Tuple[Any, Sequence[str], str]] = (  # where torch has each; all but __rsub__ subtract from the first
     (torch.Tensor, ("__sub__", "__rsub__", "__isub__", "sub", "sub_", "subtract", "subtract_"), "signed"),
     (torch, ("sub", "subtract", "rsub"), "signed"),
+    (torch, ("cdist", "dist"), "distance: of any norm"),
     (torch.nn.functional, ("l1_loss",), "l1"),
     (torch.nn.functional, ("mse_loss",), "squared"),
+    (torch.nn.functional, ("pairwise_distance",), "distance: of any norm"),
     (torch.nn.functional, ("smooth_l1_loss", "huber_loss"), "robust"),
     (legs_loss, ("l1_loss",), "weighted"),
     (legs_loss.runtime, ("l1_loss",), "weighted"),

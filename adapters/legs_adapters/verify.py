@@ -126,18 +126,19 @@ def verify(
     with work_folder("legs-verify-") as work:
         scene = write_embedded_scene(work / "scene", **SCENE)
         precompute(read_scene(scene), scene / "legs_weights")
-        patched, unpatched = (work / name / root.name for name in ("patched", "unpatched"))
+        given = work / "given" / root.name
         with locked(root, f"legs-patch --verify {folder}") as stop:
-            for copy in (patched, unpatched):
-                shutil.copytree(str(root), str(copy), symlinks=True, ignore=lambda *at: stop() or _unneeded(*at))
-        if not (patched / JOURNAL).is_file():  # undone by another one, before this one had the lock
+            shutil.copytree(str(root), str(given), symlinks=True, ignore=lambda *at: stop() or _unneeded(*at))
+        if not (given / JOURNAL).is_file():  # undone by another one, before this one had the lock
             raise LegsError(f"{root} is not patched any more: nothing to verify")
-        undo(unpatched, force=True)
         variables: Dict[str, Dict[str, str]] = {"unpatched": {}, "patched": {}, "LEGS_OFF": {"LEGS_OFF": "1"}}
-        if b"legs_loss.ssim" in (patched / JOURNAL).read_bytes():
+        if b"legs_loss.ssim" in (given / JOURNAL).read_bytes():
             variables["beta 0"] = {"LEGS_BETA": "0"}
         for name, settings in variables.items():
-            copy = unpatched if name == "unpatched" else patched
+            # each its own: what one writes beside the script, the next would find
+            copy = Path(shutil.copytree(str(given), str(work / name / root.name), symlinks=True))
+            if name == "unpatched":
+                undo(copy, force=True)
             places = {"scene": scene, "output": work / f"output-{name}"}
             more = filled(copy / command.script, arguments, command.arguments, iterations, **places)
             whole = command._replace(arguments=[*command.arguments, *more])

@@ -28,7 +28,10 @@ def verdict(done):
 @pytest.mark.slow
 class TestVerify:
     def test_a_patch_that_took(self, tmp_path):
-        root = checkout(tmp_path / "miniature", texts())
+        found = texts()
+        folder = "    safe_state()\n    __import__('os').mkdir('mine')\n"  # it fails where another run was before
+        found["train.py"] = found["train.py"].replace("    safe_state()\n", folder)
+        root = checkout(tmp_path / "miniature", found)
         unpatched = snapshot(root)
         done = verify(root)
         assert done.returncode == 0, done.stdout + done.stderr

@@ -6,7 +6,7 @@ import json
 
 import pytest
 from legs_adapters.trace.child import Run
-from legs_adapters.verify import Verdict
+from legs_adapters.verify import Verdict, _claims
 
 from tests.patcher.support import checkout, legs_patch, snapshot
 from tests.patcher.traced import write, write_scene
@@ -132,6 +132,13 @@ class TestReport:
         found = Verdict({"unpatched": plain, "patched": patched, "LEGS_OFF": plain}, {}).text()
         assert "unpatched  4 steps, 40 ms a step" in found
         assert "step       patched takes 1.50 times the unpatched one's time (medians)" in found
+
+    @pytest.mark.parametrize("under", [3, 4])
+    def test_a_step_that_is_not_weighted_is_found_out_though_the_one_after_the_last_is(self, under):
+        off = Run(0, ["0x1p+0"] * 4)
+        patched = Run(0, ["0x2p+0"] * 4, weighted=under + 1, terms=[{"kind": "weighted", "shares": [1.0] * under}])
+        claims = _claims({"unpatched": off, "patched": patched, "LEGS_OFF": off})
+        assert [claim for claim, held in claims.items() if not held] == ["every step was weighted"] * (4 - under)
 
     def test_a_run_without_steps_is_not_compared(self):
         ended = Run(1, error="error")

@@ -114,7 +114,7 @@ def test_verify_beside_another(other, number, tmp_path, monkeypatch):
 def look(root, _, command, *others):
     """Stand in for a training: exit code 0 where the copy is wholly patched, or wholly not."""
     patched = "legs_loss.l1_loss" in (root / command.script).read_text()
-    wanted = root.parent.name == "patched"
+    wanted = root.parent.name != "unpatched"
     return run_of_none()._replace(code=0 if patched == wanted else 1)
 
 

@@ -1,4 +1,4 @@
-"""Which expression a trace means where a line has several: by the columns of its stack, from Python 3.11 on."""
+"""The expression that a trace means on a line of several: by the columns of its stack, from Python 3.11 on."""
 
 from __future__ import annotations
 

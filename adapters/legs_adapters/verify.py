@@ -11,7 +11,7 @@ import math
 import os
 import shutil
 from pathlib import Path
-from typing import Dict, List, NamedTuple, Optional, Sequence
+from typing import Dict, Iterable, List, NamedTuple, Optional, Sequence
 
 from legs_adapters.checkout.replace import locked
 from legs_adapters.code.sources import check_root
@@ -146,12 +146,12 @@ def verify(
             if not runs["unpatched"].losses:
                 return Verdict(runs, {"the unpatched script trained": False})
     claims = _claims(runs)
-    return Verdict(runs, claims if by_hand else {**claims, **_of_terms(list(Traced.read(runs["patched"].terms)))})
+    return Verdict(runs, claims if by_hand else {**claims, **_of_terms(Traced.read(runs["patched"].terms))})
 
 
 def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
     unpatched, patched, off = (list(runs[name].losses) for name in ("unpatched", "patched", "LEGS_OFF"))
-    # (Of calls there is one more: the step that is ended has made its own.)
+    # Under the losses: of calls there is one more, in the step that is ended.
     under = [share for term in runs["patched"].terms if term["kind"] == "weighted" for share in term["shares"]]
     claims = {
         "all three trained": all(run.code == 0 and run.losses for run in runs.values()),
@@ -167,7 +167,7 @@ def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
     return claims
 
 
-def _of_terms(terms: Sequence[Traced]) -> Dict[str, bool]:
+def _of_terms(terms: Iterable[Traced]) -> Dict[str, bool]:
     """Return a claim for each L1 but those of pictures of no known file: that of a photograph is weighted, no other."""
     claims: Dict[str, bool] = {}
     for term in terms:

@@ -131,7 +131,9 @@ def test_a_photograph_that_legs_loss_would_refuse_is_quoted(tmp_path):
     (tmp_path / "train.py").write_text(f"{step}{END}", encoding="utf-8")
     trace = Trace([term(frame._replace(line=2, span=(2, 11, 29)), largest=241.0)], frozenset())
     findings = plan(tmp_path, trace=trace).findings
-    assert findings.sites == [] and "its values go up to 241: divide both pictures" in findings.problems[0].reason
+    (problem,) = findings.problems
+    assert findings.sites == [] and problem.reason.endswith("its values go up to 241")
+    assert problem.advice == "bring both pictures to [0, 1] before it"
 
 
 @pytest.mark.parametrize("largest", [1.0, 241.0])

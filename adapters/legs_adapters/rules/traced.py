@@ -143,8 +143,9 @@ class _Join:
         own = [c for c in stack if (c.function.module.path, c.function.name) not in self.trace.scripted]
         is_read = any(self.analysis.training.scores(candidate.form.node) for candidate in own)
         why = "nothing shows that its gradient is more than read" if is_read else ""
+        advice = "give the term of the photograph a line of its own, legs_loss.l1_loss(rendering, photograph)"
         if traced.largest > SURELY_NOT_UNIT_RANGE:  # legs_loss would refuse it in the first step
-            why = f"its values go up to {traced.largest:g}: divide both pictures by 255 before"
+            why, advice = f"its values go up to {traced.largest:g}", "bring both pictures to [0, 1] before it"
         elif read is not None:
             return [read._replace(why=traced.text(self._name(traced, stack)))]
         for candidate in sorted(own, key=self._is_definition) if not why else ():
@@ -152,7 +153,6 @@ class _Join:
             if uses is not None:
                 return [] if candidate.key in self.settled else [self._weighted(traced, candidate, uses)]
         why = why or ("serves other terms of the trace, too" if own else "no call or difference of them alone is there")
-        advice = "give the term of the photograph a line of its own, legs_loss.l1_loss(rendering, photograph)"
         return [self._quoted(traced, stack, why, advice, min(own, key=self._is_definition).depth if own else 0)]
 
     def _weighted(self, traced: Traced, candidate: _Candidate, uses: List[Use]) -> Any:
@@ -216,8 +216,8 @@ class _Join:
             return
         if not stack:  # that of a photograph is said: it is squared, or compiled; signed where no other is known
             here = self._line(traced.frames[0])
-            is_said = traced.kind not in ("l1", *["signed"] * self.is_known) and not traced.why_other
-            if is_said and here.path in self.analysis.program.sources:
+            is_silent = traced.why_other or traced.kind == "l1" or (traced.kind == "signed" and self.is_known)
+            if not is_silent and here.path in self.analysis.program.sources:
                 self.entries.append(Left(*here, traced.text(self._name(traced, [])), (here,)))
                 self.settled.update([(here.path, here.line, -1)] if traced.kind != "signed" else [])
             return

@@ -52,8 +52,8 @@ def trace(root: Path, text: str, steps: int, cpu: bool = False, photos: Optional
         sys.exit(seen.code if seen.code > 0 else 128 - seen.code)
     if seen.failure:
         say(f"legs-patch: warning: a difference could not be watched ({seen.failure})", sys.stderr)
-    kernels = f"a trace cannot look into fused kernels, as these under the loss: {', '.join(seen.unseen)}"
-    unseen = [kernels] if seen.unseen else []
+    kernels = ", ".join(seen.unseen)
+    unseen = [f"a trace cannot look into fused kernels, as these under the loss: {kernels}"] if kernels else []
     terms = list(Traced.read(seen.terms))
     if not terms:
         passes = f"{seen.backward_passes or 'no'} backward passes seen"

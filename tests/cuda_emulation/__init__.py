@@ -7,6 +7,7 @@ GPU, and the kernels that it launches are legs.cu, compiled for the CPU.
 from __future__ import annotations
 
 import ctypes
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -64,7 +65,7 @@ def libraries(flags: Sequence[str] = ()) -> Libraries:
         command = [str(COMPILER), "-O1", "-std=c++17", "-shared", "-fPIC", "-o", str(path), str(HERE / f"{name}.cpp")]
         subprocess.run([*command, "-ldl", "-pthread"], check=True)
         found.append(ctypes.CDLL(str(path)))
-    command_of_kernels = " ".join([str(COMPILER), *FLAGS, *flags, str(HERE / "emulate.cpp")])
+    command_of_kernels = " ".join(map(shlex.quote, [str(COMPILER), *FLAGS, *flags, str(HERE / "emulate.cpp")]))
     # Python's os.environ is not seen by a library that is loaded already where it copies; setenv is.
     ctypes.CDLL(None).setenv(b"LEGS_EMULATION_COMMAND", command_of_kernels.encode(), 1)
     found[0].test_calls.restype = ctypes.c_longlong

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -27,7 +28,7 @@ def test_each_codebase_and_scene_is_one_comparison(tmp_path: Path) -> None:
     checkouts = ["--inria", "INRIA", "--fastgs", root, "--nerficg", "NERF"]
     done = reproduce(*checkouts, "--data", "DATA", "--scenes", "truck", "garden", "room", "--dry-run")
     assert done.returncode == 0, done.stderr
-    lines = [line.partition("compare.py ")[2] for line in done.stdout.splitlines()]
+    lines = [re.split("compare.py'? ", line)[-1] for line in done.stdout.splitlines()]  # of a path with a space
     assert len(lines) == 9 and all(line.startswith("DATA/") for line in lines)
     find = {(line.split("--profile ")[1].split()[0], line.split()[0].rpartition("/")[2]): line for line in lines}
     assert "--images images_4" in find["3dgs", "garden"] and "--images images_2" in find["3dgs", "room"]

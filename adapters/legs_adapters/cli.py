@@ -180,11 +180,8 @@ def _patch(args: argparse.Namespace) -> int:
     if not is_decided or (problems and args.strict):
         _show(args, found)
         if not problems:
-            raise LegsError(
-                f"no photometric L1 term was found in {args.folder}: {offered(found.findings)}"
-                + _elsewhere(root, args.exclude, found),
-                *instead,
-            )
+            what = offered(found.findings) + _elsewhere(root, args.exclude, found)
+            raise LegsError(f"no photometric L1 term was found in {args.folder}: {what}", *instead)
         _quote(problems, "error", instead)
         ways = ["--site FILE:LINE takes your word", "--exclude leaves files out"]
         ways = ways if args.trace else ['--trace "train.py ARGUMENTS" decides by a few steps', *ways]
@@ -223,9 +220,9 @@ def _elsewhere(root: Path, exclude: Sequence[str], found: Plan) -> str:
     files = [f"{file.path}: {file.reason}" for file in found.findings.unreadable]
     skipped = sorted(folder for _, inner in folders_of(root, exclude) for folder in inner if folder.why in PATCHABLE)
     folders = [f"{folder.path} ({folder.why})" for folder in skipped]
-    return (f"; not read: {first_of(files, 1)}" if files else "") + (
-        f"; not searched: {first_of(folders, 3)}: run legs-patch on the one that trains" if folders else ""
-    )
+    unread = f"; not read: {first_of(files, 1)}" if files else ""
+    trains = "run legs-patch on the one that trains"
+    return unread + (f"; not searched: {first_of(folders, 3)}: {trains}" if folders else "")
 
 
 def _verify(args: argparse.Namespace, command: Command) -> int:

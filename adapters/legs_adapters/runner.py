@@ -64,8 +64,7 @@ def run_script(
         raise LegsError(f"{script} is not a file: give the training script")
     for option in ("--cpu", "--ssim", "--masks"):
         if option in arguments and option[2:].encode() not in path.read_bytes():
-            behind = f"{option} stands behind {script}, which does not know it"
-            raise LegsError(f"{behind}: legs run {option} {script} ...")
+            raise LegsError(f"{option} stands behind {script}, which does not know it: legs run {option} {script} ...")
     find_config(path, argv=[])  # report wrong settings now, not at the first training step
     root = check_root(checkout_of(path))
     found = plan(root, in_place=True, ssim=ssim, masks=masks)

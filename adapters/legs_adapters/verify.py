@@ -11,7 +11,7 @@ import math
 import os
 import shutil
 from pathlib import Path
-from typing import Dict, Iterable, List, NamedTuple, Optional, Sequence
+from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Sequence, Set
 
 from legs_adapters.checkout.replace import locked
 from legs_adapters.code.sources import check_root
@@ -145,26 +145,34 @@ def verify(
             runs[name] = run_watched(copy, work, whole, iterations, True, photos, settings)
             if not runs["unpatched"].losses:
                 return Verdict(runs, {"the unpatched script trained": False})
-    claims = _claims(runs)
-    return Verdict(runs, claims if by_hand else {**claims, **_of_terms(Traced.read(runs["patched"].terms))})
+    of_terms = {} if by_hand else _of_terms(Traced.read(runs["patched"].terms))
+    return Verdict(runs, {**_claims(runs, by_hand), **of_terms})
 
 
-def _claims(runs: Dict[str, Run]) -> Dict[str, bool]:
+def _claims(runs: Dict[str, Run], by_hand: bool) -> Dict[str, bool]:
     unpatched, patched, off = (list(runs[name].losses) for name in ("unpatched", "patched", "LEGS_OFF"))
-    # Under the losses: of calls there is one more, in the step that is ended.
-    under = [share for term in runs["patched"].terms if term["kind"] == "weighted" for share in term["shares"]]
+    # Those with an L1 of a photograph under them: a step may have another backward pass, of a regulariser alone.
+    known = _under(runs["unpatched"], lambda term: term.is_photometric) or {*range(1, len(unpatched) + 1)}
+    weighted = _under(runs["patched"], lambda term: term.kind == "weighted")
+    losses = weighted if by_hand else known
+    same = {at for at, (one, other) in enumerate(zip(unpatched, patched), 1) if one == other}
     claims = {
         "all three trained": all(run.code == 0 and run.losses for run in runs.values()),
         "as many steps each": len(unpatched) == len(patched) == len(off),
         "with LEGS_OFF=1 every loss is the unpatched one, bit for bit": off == unpatched,
-        "with LEGS every loss is another": all(one != other for one, other in zip(unpatched, patched)),
-        "every step was weighted": len(under) >= len(patched) > 0,
+        "with LEGS every loss of a photograph is another": not losses & same,
+        "every loss of a photograph was weighted": bool(weighted) and losses <= weighted,
         "nothing was weighted with LEGS_OFF=1": runs["LEGS_OFF"].weighted == 0,
     }
     if "beta 0" in runs:
-        equal = _are_close(unpatched, runs["beta 0"].losses)
-        claims["with beta 0 every loss is the unpatched one, up to the rounding of the SSIM"] = equal
+        claim = "with beta 0 every loss is the unpatched one, up to the rounding of the SSIM"
+        claims[claim] = _are_close(unpatched, runs["beta 0"].losses)
     return claims
+
+
+def _under(run: Run, wanted: Callable[[Traced], bool]) -> Set[int]:
+    """Return the numbers of the losses that terms lie under."""
+    return set().union(*(term.passes for term in Traced.read(run.terms) if wanted(term)))
 
 
 def _of_terms(terms: Iterable[Traced]) -> Dict[str, bool]:
@@ -189,11 +197,10 @@ def _script(root: Path) -> str:
     found = plan(root).findings
     files = sorted({site.path for site in found.sites} | {site.path for site in found.patched})
     trains = [name for name in files if b"__main__" in (root / name).read_bytes()]
-    if len(trains) == 1:
-        return trains[0]
-    if "train.py" in trains or (not trains and (root / "train.py").is_file()):
-        return "train.py"
-    raise LegsError(f"cannot tell which script trains: use --script; weighted files: {', '.join(files) or 'none'}")
+    trains = trains or ["train.py"] * (root / "train.py").is_file()
+    if len(trains) != 1 and "train.py" not in trains:
+        raise LegsError(f"cannot tell which script trains: use --script; weighted files: {', '.join(files) or 'none'}")
+    return trains[0] if len(trains) == 1 else "train.py"
 
 
 def _unneeded(folder: str, names: List[str]) -> List[str]:

@@ -16,6 +16,10 @@ pytest.importorskip("numba")
 pytest.importorskip("scipy")
 
 
+ANOTHER = "with LEGS every loss of a photograph is another"
+WEIGHTED = "every loss of a photograph was weighted"
+
+
 def verify(root, *arguments):
     return legs_patch("--verify", "--json", "--iterations", "6", root, *arguments, timeout=900)
 
@@ -61,7 +65,7 @@ class TestVerify:
         assert done.returncode == 1
         failed = {claim for claim, held in verdict(done)["holds"].items() if not held}
         plain = {claim for claim in failed if claim.startswith("train.py:")}
-        assert failed - plain == {"with LEGS every loss is another", "every step was weighted"}
+        assert failed - plain == {ANOTHER, WEIGHTED}
         assert [" is weighted: " in claim and "is images/" in claim for claim in plain] == [True]
 
     def test_a_script_that_cannot_run_is_shown(self, tmp_path):
@@ -125,6 +129,39 @@ class TestTerms:
         assert [claim for claim, held in claims.items() if not held] == [f"{colour} is weighted"], claims
 
 
+def terms_under(kind, passes):
+    """Return what a run reports of one L1 of a photograph under these losses, and in a pass of no loss."""
+    shares = [(at, 0.5) for at in (0, *passes)]
+    match = {"path": "a.png", "correlation": 1.0, "is_photograph": True}
+    return [{
+        "frames": [], "kind": kind, "target": 1, "shape": [3, 8, 8], "is_picture": True, "match": match,
+        "is_known": True, "largest": 1.0, "is_rival": False, "shares": shares, "steps": 9, "gaussians": 9,
+        "parameters": [], "stepped": [], "poses": 0,
+    }] * bool(passes)  # fmt: skip
+
+
+OTHER_PASSES = """
+for step in range(100):
+    camera = views[step % len(views)]
+    drawn, gt_image = splats.draw(camera), camera.values["images"]
+    if step % 2:
+        (0.2 * (drawn["rgb"] - gt_image).square().mean()).backward()
+    else:
+        F.l1_loss(drawn["rgb"], gt_image).backward()
+    (0.01 * splats.opacity.square().mean()).backward()
+    splats.optimizer.step()
+    splats.optimizer.zero_grad()
+"""
+
+
+@pytest.mark.slow
+def test_a_step_of_several_passes_of_which_one_is_of_a_photograph(tmp_path):
+    write(tmp_path / "code", OTHER_PASSES)
+    done = verify(tmp_path / "code", "--arguments", f"-s {write_scene(tmp_path / 'scene')}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert verdict(done)["holds"][WEIGHTED] and verdict(done)["runs"]["patched"]["weighted"] > 1
+
+
 class TestReport:
     def test_both_steps_times_are_compared(self):
         plain = Run(0, ["0x1p+0"] * 4, [0.05, 0.04, 0.01], plain=4)
@@ -133,12 +170,22 @@ class TestReport:
         assert "unpatched  4 steps, 40 ms a step" in found
         assert "step       patched takes 1.50 times the unpatched one's time (medians)" in found
 
-    @pytest.mark.parametrize("under", [3, 4])
-    def test_a_step_that_is_not_weighted_is_found_out_though_the_one_after_the_last_is(self, under):
-        off = Run(0, ["0x1p+0"] * 4)
-        patched = Run(0, ["0x2p+0"] * 4, weighted=under + 1, terms=[{"kind": "weighted", "shares": [1.0] * under}])
-        claims = _claims({"unpatched": off, "patched": patched, "LEGS_OFF": off})
-        assert [claim for claim, held in claims.items() if not held] == ["every step was weighted"] * (4 - under)
+    @pytest.mark.parametrize(
+        ("of_photographs", "weighted", "by_hand", "failing"),
+        [
+            ((1, 3, 5), (1, 3, 5), False, []),  # each second pass is a regulariser's
+            ((1, 3, 5), (1, 3, 3), False, [WEIGHTED]),  # two terms under one loss hide none without
+            ((1, 2, 3, 5), (1, 2, 3, 5), False, [ANOTHER]),
+            ((), (1, 3, 5), False, [ANOTHER, WEIGHTED]),  # no picture is known: every loss counts
+            ((1, 3, 5), (1, 5), True, []),  # the user chose
+            ((1, 3, 5), (), True, [WEIGHTED]),
+        ],
+    )
+    def test_each_loss_of_a_photograph_is_to_be_weighted_and_another(self, of_photographs, weighted, by_hand, failing):
+        off = Run(0, ["0x1p+0"] * 6, terms=terms_under("l1", of_photographs))
+        patched = Run(0, ["0x2p+0", "0x1p+0"] * 3, weighted=4, terms=terms_under("weighted", weighted))
+        claims = _claims({"unpatched": off, "patched": patched, "LEGS_OFF": off}, by_hand)
+        assert [claim for claim, held in claims.items() if not held] == failing
 
     def test_a_run_without_steps_is_not_compared(self):
         ended = Run(1, error="error")

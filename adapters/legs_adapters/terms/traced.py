@@ -38,6 +38,7 @@ class Traced(NamedTuple):
         parameters, stepped: names and shapes of what is stepped after it.
         steps, poses: how many steps moved more than poses, exposures and embeddings; and how many only those.
         is_picture: whether that side is a picture of three or four channels.
+        passes: under which losses it lay, by their numbers from 1.
     """
 
     frames: Tuple[Frame, ...]
@@ -55,6 +56,7 @@ class Traced(NamedTuple):
     steps: int
     poses: int
     is_picture: bool
+    passes: FrozenSet[int] = frozenset()
 
     @classmethod
     def read(cls, terms: Sequence[Dict[str, Any]]) -> Iterator[Traced]:
@@ -62,7 +64,8 @@ class Traced(NamedTuple):
         for term in (term for term in terms if term["steps"] or term["poses"]):
             frames = tuple(Frame(*frame) for frame in term["frames"])
             rest = {name: value for name, value in term.items() if name not in ("frames", "shares")}
-            yield cls(frames=frames, share=sum(term["shares"]) / max(1, len(term["shares"])), **rest)
+            passes, shares = zip(*term["shares"])
+            yield cls(frames=frames, share=sum(shares) / len(shares), passes=frozenset(passes) - {0}, **rest)
 
     @property
     def is_l1(self) -> bool:

@@ -30,9 +30,8 @@ from legs_loss.cli import exit_code
 from legs_loss.system.locks import FileLock, is_held
 from legs_loss.system.terminal import is_first_process
 
-_SETTINGS = {  # no bytecode is written into the checkout; torch.compile and TorchScript cannot be watched
-    "PYTHONDONTWRITEBYTECODE": "1", "TORCHDYNAMO_DISABLE": "1", "PYTORCH_JIT": "0",
-}  # fmt: skip
+# No bytecode is written into the checkout; torch.compile and TorchScript cannot be watched.
+_SETTINGS = {"PYTHONDONTWRITEBYTECODE": "1", "TORCHDYNAMO_DISABLE": "1", "PYTORCH_JIT": "0"}
 # For runs that are compared; of two threads one may wait for its turn, and counts as work.
 _THE_SAME = {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 _SECONDS = 1800  # that a run which is compared may take

@@ -102,6 +102,5 @@ def filled(script: Path, text: Optional[str], given: Sequence[str], iterations: 
     try:
         return [word.format(**values) for word in shlex.split(text)]
     except (KeyError, IndexError, ValueError) as error:
-        raise LegsError(
-            f"--arguments {text!r}: only {{scene}}, {{output}}, {{iterations}}, {{port}}: {error}"
-        ) from None
+        known = "only {scene}, {output}, {iterations}, {port}"
+        raise LegsError(f"--arguments {text!r}: {known}: {error}") from None

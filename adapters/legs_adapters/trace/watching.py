@@ -239,12 +239,13 @@ class Watch:
             if any(made[name] >= most for name, most in self.limits.items()):
                 self.ended()
             roots = list(tensors) if isinstance(tensors, (tuple, list)) else [tensors]
-            if is_step and len(roots) == 1 and roots[0].numel() == 1:
+            is_loss = is_step and len(roots) == 1 and roots[0].numel() == 1
+            if is_loss:
                 self.seen["losses"].append(float(roots[0].detach()).hex())
                 self.times.append(time.process_time())
             seen = self._seen(roots) or []
             gradients = own(tensors, *args, **kwargs)
-            self._sum_up(roots, seen)
+            self._sum_up(roots, seen, len(self.seen["losses"]) if is_loss else 0)
             return gradients
 
         return watched
@@ -287,14 +288,14 @@ class Watch:
         return key, match, as_planes(record.still) if whole is None else whole
 
     @_harmless
-    def _sum_up(self, roots: Sequence[Any], seen: Sequence[Tuple[_Record, Any, List[Any]]]) -> None:
+    def _sum_up(self, roots: Sequence[Any], seen: Sequence[Tuple[_Record, Any, List[Any]]], at: int) -> None:
         self.seen["backward_passes"] += 1
         loss = sum(float(root.detach().sum()) for root in roots)
         for record, key, leaves in seen:
             if not record.shares:
                 continue  # its gradient was not asked for
             share = sum(float(part) for part in record.shares) / (loss or 1.0)
-            self.terms[key]["shares"].append(share / 2 if self.terms[key]["kind"] == "squared" else share)
+            self.terms[key]["shares"].append((at, share / 2 if self.terms[key]["kind"] == "squared" else share))
             self._waiting.setdefault(key, set()).update(map(id, leaves))
             for leaf in leaves:
                 if id(leaf) not in self._samples or self._samples[id(leaf)].leaf() is not leaf:

@@ -162,6 +162,7 @@ def _patch(args: argparse.Namespace) -> int:
     from legs_adapters.terms.instead import offered, trained_instead
     from legs_adapters.trace.tracing import trace
     from legs_adapters.undo import unrecorded
+    from legs_adapters.unsearched import unread
 
     if not args.trace and (args.cpu or args.photos):
         raise LegsError('--cpu and --photos belong to --trace "SCRIPT ARGUMENTS"')
@@ -180,7 +181,7 @@ def _patch(args: argparse.Namespace) -> int:
     if not is_decided or (problems and args.strict):
         _show(args, found)
         if not problems:
-            what = offered(found.findings) + _elsewhere(root, args.exclude, found)
+            what = offered(found.findings) + unread(root, args.exclude, found.findings)
             raise LegsError(f"no photometric L1 term was found in {args.folder}: {what}", *instead)
         _quote(problems, "error", instead)
         ways = ["--site FILE:LINE takes your word", "--exclude leaves files out"]
@@ -211,18 +212,6 @@ def _show(args: argparse.Namespace, found: Plan, wrote: Sequence[str] = ()) -> N
 
     text = as_json(found, wrote) if args.json else as_table(found)
     say(text, sys.stderr if args.diff and not args.json else None, end="", lines=True)
-
-
-def _elsewhere(root: Path, exclude: Sequence[str], found: Plan) -> str:
-    """Name the first of the files that could not be read, and of the folders that are skipped and may be codebases."""
-    from legs_adapters.code.folders import PATCHABLE, first_of, folders_of
-
-    files = [f"{file.path}: {file.reason}" for file in found.findings.unreadable]
-    skipped = sorted(folder for _, inner in folders_of(root, exclude) for folder in inner if folder.why in PATCHABLE)
-    folders = [f"{folder.path} ({folder.why})" for folder in skipped]
-    unread = f"; not read: {first_of(files, 1)}" if files else ""
-    trains = "run legs-patch on the one that trains"
-    return unread + (f"; not searched: {first_of(folders, 3)}: {trains}" if folders else "")
 
 
 def _verify(args: argparse.Namespace, command: Command) -> int:

@@ -18,6 +18,7 @@ from legs_adapters.code.sources import check_root
 from legs_adapters.plan import plan
 from legs_adapters.rewritten import execute
 from legs_adapters.terms.instead import offered, trained_instead
+from legs_adapters.unsearched import unread
 from legs_loss import LegsError
 from legs_loss.config import find_config
 from legs_loss.system.terminal import is_first_process, say
@@ -79,7 +80,8 @@ def run_script(
     for text in said if is_plain else (*said, *instead):
         _say(f"not weighted: {text}")
     if is_plain:
-        none = f"no photometric L1 term was found in {root}: {offered(found.findings, f'legs-patch {root} ')}"
+        what = offered(found.findings, f"legs-patch {root} ") + unread(root, (), found.findings)
+        none = f"no photometric L1 term was found in {root}: {what}"
         if not cpu:
             raise LegsError(none, *instead)
         for text in (f"nothing is weighted: {none}", *instead):

@@ -1,4 +1,4 @@
-"""Find what may be the loss in the folders of a checkout that are not searched: submodules and third-party code."""
+"""Find what may be the loss where a plan does not look: in submodules, third-party code, files that are not read."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import shlex
 from pathlib import Path
 from typing import Any, Dict, Iterator, List, NamedTuple, Sequence, Tuple
 
-from legs_adapters.code.folders import LINK, SUBMODULE, VENDORED, WORKTREE, folders_of
+from legs_adapters.code.folders import LINK, PATCHABLE, SUBMODULE, VENDORED, WORKTREE, first_of, folders_of
 from legs_adapters.code.limits import Budget
 from legs_adapters.code.sources import Source, read_files
 from legs_adapters.lexicon.words import SPLATS
 from legs_adapters.rules.find import find
-from legs_adapters.terms.findings import Line
+from legs_adapters.terms.findings import Findings, Line
 from legs_loss import LegsError
 
 
@@ -62,3 +62,13 @@ def _skipped(root: Path, below: str, exclude: Sequence[str]) -> Iterator[Tuple[s
         path = f"{below}/{path}".lstrip("/")
         yield path, why
         yield from () if why == LINK else _skipped(root, path, exclude)
+
+
+def unread(root: Path, exclude: Sequence[str], found: Findings) -> str:
+    """Name the first of the files that could not be read, and of the folders that are skipped and may be codebases."""
+    files = [f"{file.path}: {file.reason}" for file in found.unreadable]
+    skipped = sorted(folder for _, inner in folders_of(root, exclude) for folder in inner if folder.why in PATCHABLE)
+    folders = [f"{folder.path} ({folder.why})" for folder in skipped]
+    said = f"; not read: {first_of(files, 1)}" if files else ""
+    trains = "run legs-patch on the one that trains"
+    return said + (f"; not searched: {first_of(folders, 3)}: {trains}" if folders else "")

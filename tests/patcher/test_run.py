@@ -250,10 +250,12 @@ class TestAsPythonRunsIt:
         [
             (["nowhere.py"], "nowhere.py is not a file"),
             (["plain.py"], "no photometric L1 term was found"),
+            (["plain.py"], "; not read: latin.py: not UTF-8 (byte 28)"),
         ],
     )
     def test_what_cannot_be_run_is_one_line(self, arguments, message, tmp_path):
         (tmp_path / "plain.py").write_text("print('never')\n")
+        (tmp_path / "latin.py").write_bytes("# -*- coding: latin-1 -*-\n# é\n".encode("latin-1"))
         done = legs("run", *arguments, cwd=str(tmp_path))
         assert done.returncode == 2
         assert done.stderr.startswith("legs: error: ")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 import itertools
 import re
-from typing import Any, Callable, Dict, List, Optional, Sequence, Set, Tuple, TypeVar
+from typing import Any, Callable, Dict, List, Optional, Sequence, Set, Tuple
 
 from legs_adapters.code.calls import callees, given_to, likely_calls, values_of
 from legs_adapters.code.limits import remembered
@@ -33,7 +33,6 @@ from legs_adapters.tensors.operations import NEW_TENSORS
 from legs_adapters.tensors.steps import has_step, is_backward, is_step, may_step, reads_gradients
 from legs_adapters.terms.findings import Evidence
 
-_T = TypeVar("_T")
 _DEPTH = 3
 # With the optimiser, the words of whose method runs it, and the calls that made those.
 _Step = Tuple[Function, ast.Call, ast.expr, Set[str], List[Tuple[Function, ast.Call]]]
@@ -73,7 +72,7 @@ class Purposes:
         """Return whether an optimiser that steps after the backward pass of an expression is known to have them."""
         return self._once(self._moves, function, node, depth)
 
-    def _once(self, ask: Callable[..., _T], function: Function, node: ast.AST, depth: int) -> _T:
+    def _once(self, ask: Callable[..., Any], function: Function, node: ast.AST, depth: int) -> Any:
         """Ask once for the terms of a round of a loop: the step after them is the same."""
         known = ask.__name__, function, tuple(map(id, function.flow.loops_around(node))), depth
         if known not in self._known:

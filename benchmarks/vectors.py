@@ -19,7 +19,7 @@ from numba.extending import intrinsic
 from legs_loss.kernels.compiling import compiled, multiply_add
 from legs_loss.lab.rasterizer import strips
 from legs_loss.lab.rasterizer.projection import WIDE
-from legs_loss.lab.rasterizer.strips import BLUE, GREEN, PIXELS, RED, REST, STATE, T, X
+from legs_loss.lab.rasterizer.strips import BLUE, GREEN, PIXELS, RED, REST, STATE, T, X, _blend, _blend_backward
 
 SPLATS, TURNS, CALLS = 200, 25, 200
 SUMS = STATE  # behind the state: six sums a column
@@ -127,6 +127,16 @@ def blend_backward(state, begin, end, draws, entries, moments, sums):
                 sums[at + 6 + channel] += state[SUMS + (3 + channel) * WIDE + x]
 
 
+@compiled()  # Python has no entry to a part
+def vectors(state, begin, end, draws, entries):
+    _blend(state, begin, end, draws, entries)
+
+
+@compiled()
+def vectors_backward(state, begin, end, draws, entries, moments, sums):
+    _blend_backward(state, begin, end, draws, entries, moments, sums)
+
+
 def main() -> None:
     """Compare the two, value and time."""
     random = np.random.default_rng(0)
@@ -143,11 +153,11 @@ def main() -> None:
     span = np.uint64(0), np.uint64(SPLATS), draws, entries
     moments = strips.MOMENTS
     passes = {
-        "forward": (forward, (), strips._blend, blend),
+        "forward": (forward, (), vectors, blend),
         "backward": (
             backward,
             (moments, np.zeros(SPLATS * moments, np.float32)),
-            strips._blend_backward,
+            vectors_backward,
             blend_backward,
         ),
     }

@@ -3,7 +3,8 @@
     python -m benchmarks --parts cuda-host
 
 The libcuda of the tests (compiled by g++) takes each call and returns; the images are of the CPU and tiny, so what is
-timed is autograd, the packing of arguments and the calls. On a GPU torch's own allocations cost a little more.
+timed is autograd, the packing of arguments and the calls. On a GPU torch's own allocations cost a little more, and the
+values of a given map are not checked.
 
 `legs_loss.l1_loss` and `legs_loss.legs_loss` are called as a script does, settings and memo included. One measure is
 torch's own |a - b|.mean(). The other is the least that SSIM alone can take in Python: an autograd.Function that

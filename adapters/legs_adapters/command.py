@@ -8,6 +8,7 @@ run on the CPU and a shim replaces the rasterizer: slow, but it trains.
 from __future__ import annotations
 
 import argparse
+import os
 
 from legs_adapters.cli import check_parser
 from legs_loss.errors import require
@@ -29,6 +30,7 @@ def run(args: argparse.Namespace) -> int:
     check_parser()
     if args.cpu:
         require("legs run --cpu", "cpu", "numba", "scipy")
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # or torch's idle threads spin on the cores that ours need
     from legs_adapters.runner import run_script
 
     return run_script(args.script, args.arguments, args.cpu, args.ssim, args.masks)

@@ -70,5 +70,4 @@ def unread(root: Path, exclude: Sequence[str], found: Findings) -> str:
     skipped = sorted(folder for _, inner in folders_of(root, exclude) for folder in inner if folder.why in PATCHABLE)
     folders = [f"{folder.path} ({folder.why})" for folder in skipped]
     said = f"; not read: {first_of(files, 1)}" if files else ""
-    trains = "run legs-patch on the one that trains"
-    return said + (f"; not searched: {first_of(folders, 3)}: {trains}" if folders else "")
+    return said + (f"; not searched: {first_of(folders, 3)}: run legs-patch on the one that trains" if folders else "")

@@ -254,3 +254,17 @@ def test_every_command_that_reads_a_scene_speaks_of_a_larger_model(command: str,
     assert f"{root / 'sparse' / '1'} has 3 images, and 0, which is read here as 3DGS does, has 1;" in said
     if command in ("train", "demo", "compare"):
         assert code == 2 and "of its 1 view(s) none is left to train on" in said
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="torch has another OpenMP there")
+@pytest.mark.parametrize("users", [None, "ACTIVE"])
+@pytest.mark.parametrize("command", [["train", "nowhere"], ["run", "--cpu", "script.py"]])
+def test_torch_s_idle_threads_do_not_spin_unless_the_user_says_so(
+    command: List[str], users: Optional[str], tmp_path: Path
+) -> None:
+    (tmp_path / "script.py").write_text("import torch\n", encoding="utf-8")
+    environment = {name: value for name, value in legs_environment().items() if name != "OMP_WAIT_POLICY"}
+    environment.update(OMP_DISPLAY_ENV="TRUE", **({"OMP_WAIT_POLICY": users} if users else {}))
+    command = [sys.executable, "-m", "legs_loss", *command]  # torch is loaded anew: then its OpenMP reads the variable
+    done = subprocess.run(command, cwd=str(tmp_path), env=environment, capture_output=True, text=True, timeout=300)
+    assert f"OMP_WAIT_POLICY = '{users or 'PASSIVE'}'" in done.stderr

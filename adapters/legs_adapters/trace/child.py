@@ -104,7 +104,7 @@ def run_watched(
             the user's that begin with LEGS_ are never passed on.
     """
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LEGS_")}
-    environment.update(_SETTINGS, **({"CUDA_VISIBLE_DEVICES": ""} if cpu else {}))
+    environment.update(_SETTINGS, **({"CUDA_VISIBLE_DEVICES": "", "OMP_WAIT_POLICY": "PASSIVE"} if cpu else {}))
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     report = Path(tempfile.mkdtemp(dir=str(work))) / "report.json"
     spec: Dict[str, Any] = {"report": str(report), "root": str(root), "work": str(work), "cpu": cpu}

@@ -9,6 +9,7 @@ cfg.json and metrics.json.
 from __future__ import annotations
 
 import argparse
+import os
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, Optional
@@ -58,13 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     places.add_argument("--store", type=Path, metavar="DIR", help="weight maps; default: SCENE/legs_weights")
     places.add_argument("--tensorboard", type=Path, metavar="DIR", help="log loss, PSNR and Gaussians there")
     places.add_argument("--threads", type=int, metavar="N", help="default: one per core")
-    places.add_argument(
-        "--checkpoint_every", type=int, default=500, metavar="N", help="iterations between checkpoints; default: 500"
-    )
+    every = "iterations between checkpoints; default: 500"
+    places.add_argument("--checkpoint_every", type=int, default=500, metavar="N", help=every)
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, or resume a training, and print the scores."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # or torch's idle threads spin on the cores that ours need
     from legs_loss.cli.shared.checks import check_resolution, check_writable
     from legs_loss.errors import LegsError
     from legs_loss.lab.report.tensorboard import tensorboard_log

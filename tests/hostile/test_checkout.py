@@ -72,7 +72,7 @@ def test_verify_copies_what_is_a_file(stranger, monkeypatch, capsys):
     monkeypatch.setattr(
         verifying, "run_watched", lambda root, *_: seen.append(sorted(os.listdir(str(root)))) or run_of_none()
     )
-    monkeypatch.setattr(verifying, "_claims", lambda runs: {"all copied": True})
+    monkeypatch.setattr(verifying, "_claims", lambda runs, _: {"all copied": True})
     monkeypatch.setattr(verifying, "check_imports", lambda *_: None)
     assert main(["--verify", str(stranger)]) == 0, capsys.readouterr()
     assert len(seen) == 3
@@ -95,7 +95,7 @@ def test_verify_beside_another(other, number, tmp_path, monkeypatch):
     assert main([str(root)]) == 0
     monkeypatch.setattr(verifying, "check_imports", lambda *_: None)
     monkeypatch.setattr(verifying, "run_watched", look)
-    monkeypatch.setattr(verifying, "_claims", lambda runs: {"whole": all(run.code == 0 for run in runs.values())})
+    monkeypatch.setattr(verifying, "_claims", lambda runs, _: {"whole": all(run.code == 0 for run in runs.values())})
     monkeypatch.setattr("legs_loss.lab.embedded.write_embedded_scene", lambda place, **_: place)
     monkeypatch.setattr("legs_loss.scenes.read_scene", lambda place: place)
     monkeypatch.setattr("legs_loss.precompute.precompute", lambda scene, store: None)

@@ -70,6 +70,8 @@ def main(report: str, seed: str, *words: str) -> int:
     from legs_loss.cli import main as legs
 
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    if "--cpu" in words:  # as `legs run --cpu` does, before torch is imported: here the seeds import it
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     move_seeds(int(seed))
     if words[0] == "--robust":
         import legs_loss

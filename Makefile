@@ -15,7 +15,7 @@ demo: $(VENV)/.demo
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -q -m "not slow" $(SIDE_BY_SIDE)
 
-test-slow: $(VENV)/.test
+test-slow: $(VENV)/.test $(VENV)/.lint
 	$(BIN)/python -m pytest -q -m slow $(SIDE_BY_SIDE)
 
 lint: $(VENV)/.lint

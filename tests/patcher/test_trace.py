@@ -119,6 +119,12 @@ class TestWhichTerm:
         assert known and all(term["image"]["path"].startswith("images") for term in known)
         assert all(term["gaussians"] == 150 and term["parameters"] for term in known)
 
+    def test_an_absolute_value_in_place_has_its_share(self, tmp_path):
+        lines = body('image = splats.draw(camera)["rgb"]', "loss = (image - gt_image).abs_().mean()  # <- here")
+        report, line, done = traced(tmp_path, lines)
+        assert weighted(report) == [line], done.stderr
+        assert [round(term["share"], 3) for term in report["traced"] if term["is_photometric"]] == [1.0]
+
     def test_one_loop_for_colour_and_depth_is_quoted(self, tmp_path):
         lines = body(
             "drawn, loss = splats.draw(camera), 0",

@@ -18,7 +18,6 @@ ORDER: Tuple[Rule, ...] = (
     names.Tracking(),
     names.EvaluationName(),
     steps.PoseStep(),
-    steps.OtherStep(),
     steps.NoStep(),
     other.NotSplats(),
 )

@@ -23,23 +23,19 @@ from legs_adapters.code.syntax import (
     dotted,
     entries,
     given,
-    walk_expressions,
     words,
     words_in,
 )
-from legs_adapters.lexicon.words import EMBEDDING, GAUSSIANS, MODELS, PLUMBING, POSES, RENDERERS, TENSORS
+from legs_adapters.lexicon.words import EMBEDDING, GAUSSIANS, MODELS, PLUMBING, POSES, TENSORS
 from legs_adapters.tensors.backward import Training
-from legs_adapters.tensors.operations import NEW_TENSORS
 from legs_adapters.tensors.steps import has_step, is_backward, is_step, may_step, reads_gradients
 from legs_adapters.terms.findings import Evidence
 
 _DEPTH = 3
-# With the optimiser, the words of whose method runs it, and the calls that made those.
-_Step = Tuple[Function, ast.Call, ast.expr, Set[str], List[Tuple[Function, ast.Call]]]
+_Step = Tuple[Function, ast.Call, ast.expr, Set[str]]  # with the optimiser, and the words of whose method runs it
 _Value = Tuple[Function, ast.AST]
 _STEPS = re.compile(r"step(?:(?!step)\w)*\s*\(")
 _CALLED = re.compile(r"\b(\w+)\s*\(")
-_SETS_RATES = re.compile(r"""\[["']lr["']\]\s*[-+*/]?=[^=]|add_param_group|CyclicLR|OneCycleLR""")
 _OPTIMISER = re.compile(r"Adam|SGD|RMSprop|Adagrad|LBFGS|Adadelta", re.I)
 
 
@@ -64,7 +60,7 @@ class Purposes:
             return self.purpose(caller, call)
         steps = self._after(function, node)[1]
         given = [(step, function.given(call, step[2].id)) for step in steps if isinstance(step[2], ast.Name)]
-        moved = [self._moved((caller, step[1], value, set(), [])) for step, value in given if value is not None]
+        moved = [self._moved((caller, step[1], value, set())) for step, value in given if value is not None]
         is_of_poses = bool(moved) and len(moved) == len(steps) and all(map(_are_poses, moved))
         return Evidence("pose-step", "tracking", [(caller, call)]) if is_of_poses else None
 
@@ -93,14 +89,8 @@ class Purposes:
         own, steps = self._after(function, node)
         if own is not None:
             return Evidence("no-step", "scoring", [(function, own)])
-        moved, first = [self._moved(step) for step in steps], [step[:2] for step in steps[:1]]
-        if steps and all(self._moved_by(step) == [] for step in steps):
-            return Evidence("no-step", "scoring", first)
-        if steps and all(map(_are_poses, moved)):
-            return Evidence("pose-step", "tracking", first)
-        is_other = steps and not any(some & MODELS for some in moved) and all(map(self._is_beside, steps))
-        # What is drawn is asked last: it reads much that nothing else does.
-        return Evidence("other-step", "tracking", first) if is_other and self._draws_a_model(function, 0) else None
+        is_of_poses = bool(steps) and all(_are_poses(self._moved(step)) for step in steps)
+        return Evidence("pose-step", "tracking", [steps[0][:2]]) if is_of_poses else None
 
     def _after(self, function: Function, node: ast.AST) -> Tuple[Optional[ast.Call], List[_Step]]:
         """Return the steps after the backward pass of an expression; and that pass, where none follows it."""
@@ -124,7 +114,7 @@ class Purposes:
     def _steps(self, function: Function, call: ast.Call, depth: int = 0) -> List[_Step]:
         """Return the steps of a call: its own, or those of the functions that it calls and that take no gradient."""
         if isinstance(call.func, ast.Attribute) and is_step(call):
-            return [(function, call, call.func.value, set(), [])]
+            return [(function, call, call.func.value, set())]
         name = call_name(call)
         if name not in self._stepping() or depth > _DEPTH:
             return []
@@ -132,12 +122,8 @@ class Purposes:
         if not found and isinstance(call.func, ast.Attribute):
             found = self.program.methods_named(name)  # one of them may run
         steps = [step for each in found for inner in each.flow.calls for step in self._steps(each, inner, depth + 1)]
-        holder = call.func.value if isinstance(call.func, ast.Attribute) else None
-        if holder is None or not steps:
-            return steps
-        makers = [(by, each.value) for by, each in _definitions(self.program, function, holder)]
-        made = [(by, value) for by, value in makers if isinstance(value, ast.Call)]
-        return [(where, step, of, said | words_in(holder), by + made) for where, step, of, said, by in steps]
+        runs = words_in(call.func.value) if isinstance(call.func, ast.Attribute) else set()
+        return [(where, step, of, said | runs) for where, step, of, said in steps]
 
     @remembered
     def _stepping(self) -> Set[str]:
@@ -176,31 +162,14 @@ class Purposes:
 
     def _moved(self, step: _Step) -> Set[str]:
         """Return the words in an optimiser's name, and in the parameters that it was made with."""
-        function, _, optimiser, said, makers = step
+        function, _, optimiser, said = step
         name = set(words(optimiser.attr)) if isinstance(optimiser, ast.Attribute) else set()
         found = said | (name if name & POSES else words_in(optimiser))  # gaussians.optimizer_cam moves cameras
-        for each in self._given(function, optimiser, makers):
+        for each in self._given(function, optimiser):
             found |= set().union(*(_named_in(leaf) for _, leaf in self._leaves(*each)))
         return found - PLUMBING
 
-    def _moved_by(self, step: _Step) -> Optional[List[_Value]]:
-        """Return the parameters of an optimiser; None where those are not known."""
-        function, _, optimiser, _, makers = step
-        given = self._given(function, optimiser, makers)
-        return [leaf for each in given for leaf in self._leaves(*each)] if given else None
-
-    def _is_still(self, node: ast.AST) -> bool:
-        """Return whether it is a group of parameters with the rate 0, in a checkout that sets no rate later."""
-        rates = [constant(value) for key, value in entries(node) if constant(key) == "lr"]
-        return rates == [0] and not self._sets_rates()
-
-    @remembered
-    def _sets_rates(self) -> bool:
-        return any(_SETS_RATES.search(source.text) for source in self.program.sources.values())
-
-    def _given(
-        self, function: Function, optimiser: ast.AST, makers: Sequence[Tuple[Function, ast.Call]], depth: int = 0
-    ) -> List[_Value]:
+    def _given(self, function: Function, optimiser: ast.AST, depth: int = 0) -> List[_Value]:
         """Return what an optimiser was made with, or what is passed for it where that is not known."""
         found: List[_Value] = []
         for where, definition in _definitions(self.program, function, optimiser):
@@ -208,14 +177,13 @@ class Purposes:
             if definition.kind == "parameter" and depth < _DEPTH:
                 for caller, value in given_to(self.program, where, definition.place):
                     if value is not None:
-                        found += self._given(caller, value, makers, depth + 1) or [(caller, value)]
+                        found += self._given(caller, value, depth + 1) or [(caller, value)]
             values = [(where, made)]
             if definition.kind == "element" and made is not None:  # for each in optimizers.values()
                 held = [each for part in attribute_chain(made) for each in _definitions(self.program, where, part)]
                 values = [(holder, entry) for holder, each in held for entry in _entries(each.value)]
             known = [self._made_with(*each) for each in values]
-            for by, of in itertools.chain(*known) if all(known) else ():
-                found += self._passed(by, of, makers) or [(by, of)]
+            found += itertools.chain(*known) if all(known) else ()
         return found
 
     def _made_with(self, where: Function, made: Optional[ast.AST]) -> List[_Value]:
@@ -226,28 +194,8 @@ class Purposes:
         passed = [helper.given(made, own.id) for helper, own in inner if isinstance(own, ast.Name)]  # type: ignore[arg-type]
         return [(where, each) for each in [of, *passed] if each is not None]
 
-    def _passed(self, where: Function, of: ast.AST, makers: Sequence[Tuple[Function, ast.Call]]) -> List[_Value]:
-        """Return what a parameter of a constructor was given, where calls are known that made the object."""
-        if where.name != "__init__" or not isinstance(of, ast.Name) or not where.is_parameter(of):
-            return []
-        owner, resolve = self.program.owner_of(where), self.program.resolve
-        of_class = [each for each in makers if owner in [made.target for made in resolve(each[0], each[1].func)]]
-        given = [(by, where.given(maker, of.id)) for by, maker in of_class]
-        return [(by, value) for by, value in given if value is not None]
-
-    def _is_beside(self, step: _Step) -> bool:
-        """Return whether an optimiser has tensors alone that are made for it, none for each Gaussian."""
-        leaves = [leaf for leaf in self._moved_by(step) or () if not isinstance(constant(leaf[1]), str)]
-        values: List[Tuple[Function, Optional[ast.AST]]] = []
-        for leaf in leaves:
-            made = [(where, each.value) for where, each in _definitions(self.program, *leaf)]
-            values += made or [leaf]
-        return bool(leaves) and all(_is_own_tensor(self.program, *value) for value in values)
-
     def _leaves(self, function: Function, node: ast.AST, depth: int = 0) -> List[_Value]:
         """Return the parameters in ``[{"params": [a, b]}, c]``, or in a name of such a list."""
-        if self._is_still(node):
-            return []
         inner = self._within(function, node) if depth <= _DEPTH else []
         return [leaf for each in inner for leaf in self._leaves(*each, depth + 1)] if inner else [(function, node)]
 
@@ -263,20 +211,9 @@ class Purposes:
             lists = [(function, value) for value in values]
             lists += [each for value in values for each in values_of(self.program, function, value)]
             return [each for each in lists if isinstance(each[1], (ast.List, ast.Tuple, ast.Dict))]
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and call_name(node) == "values":
-            found = _entries(function.flow.value_of(node.func.value))
         elif isinstance(node, ast.Call) and call_name(node) == "list":
             found = [arg.value for arg in given(node)]
         return [(function, each) for each in found if each is not None]
-
-    @remembered
-    def _draws_a_model(self, function: Function, depth: int) -> bool:
-        """Return whether a function gives a renderer Gaussians by their name, or calls one that does."""
-        calls = function.flow.calls
-        if any(set(words(call_name(call))) & RENDERERS and words_in(call) & GAUSSIANS for call in calls):
-            return True
-        inner = (each for call in calls for each in callees(self.program, function, call))
-        return depth < 2 and any(self._draws_a_model(each, depth + 1) for each in inner)
 
 
 def _are_poses(moved: Set[str]) -> bool:
@@ -315,18 +252,3 @@ def _entries(value: Optional[ast.AST]) -> List[Optional[ast.AST]]:
     if isinstance(value, ast.Dict):
         return list(value.values)
     return [value.elt if isinstance(value, ast.ListComp) else value.value if isinstance(value, ast.DictComp) else value]
-
-
-def _is_own_tensor(program: Program, function: Function, value: Optional[ast.AST]) -> bool:
-    """Return whether a value is a new tensor, also by a helper, whose values and sizes are none of Gaussians."""
-    made = [part for part in attribute_chain(value) if isinstance(part, ast.Call)] if value is not None else []
-    if not made:
-        return False
-    sizes = [part for arg in given(made[-1]) for part in walk_expressions(arg.value)]
-    sizes += [each for part in sizes for each in function.flow.assigned(part)]
-    counts = [part for part in sizes if isinstance(part, ast.Call) and call_name(part) == "len"]
-    if words_in(*sizes) & TENSORS or words_in(*counts) & GAUSSIANS:
-        return False
-    helpers = values_of(program, function, made[-1])
-    of_helpers = bool(helpers) and all(_is_own_tensor(program, *helper) for helper in helpers)
-    return call_name(made[-1]) in NEW_TENSORS or of_helpers

@@ -6,29 +6,25 @@ import ast
 import re
 from typing import Dict, List, Optional, Sequence, Set, Tuple
 
-from legs_adapters.code.calls import callees, given_to, handed, sure_calls
+from legs_adapters.code.calls import given_to, handed
 from legs_adapters.code.module import Function
 from legs_adapters.code.program import Program, Reference
 from legs_adapters.code.reaching import Definition, Reaching
 from legs_adapters.code.syntax import (
     arguments,
-    attribute_chain,
     call_name,
     children,
     constant,
     entries,
     given,
     key_of,
-    path_of,
-    walk_expressions,
 )
-from legs_adapters.tensors.operations import APPLIES, BACKWARD, ENDS_GRADIENT, HOOKS, LOSSES, SIZES, depends
+from legs_adapters.tensors.operations import BACKWARD, ENDS_GRADIENT, HOOKS, LOSSES, SIZES
 from legs_adapters.tensors.steps import is_backward
 
 TRAINS = re.compile(r"(?:backward|grad(?<!\wgrad))\s*\(")  # a text that runs a backward pass
 _Site = Tuple[Function, ast.Call]  # a call, behind the function that it stands in
 _ANY = object()
-_DEPTH = 2
 
 
 class Training:
@@ -36,7 +32,7 @@ class Training:
 
     Attributes:
         roots: the functions that call ``.backward()`` or return what a framework trains on. A call of
-            ``torch.autograd.grad`` is one where a parameter gets its result; else it only scores.
+            ``torch.autograd.grad`` only scores.
         sites: for a function that contributes, the calls (each with its caller) through which it does.
     """
 
@@ -56,8 +52,7 @@ class Training:
             for function in module.scopes(TRAINS.search):
                 grads = [call for call in function.flow.calls if self._is_grad(function, call)]
                 passes = [call for call in function.flow.calls if is_backward(call)]
-                passes += [call for call in grads if self._is_applied(function, call, set())]
-                scoring += [(function, call) for call in grads if call not in passes]
+                scoring += [(function, call) for call in grads]
                 self._begin(function, [value for call in passes for value in _trained_by(call)], bool(passes))
         for method in (method for name in sorted(HOOKS) for method in program.methods_named(name)):
             self._begin(method, method.flow.returns, True)
@@ -66,34 +61,6 @@ class Training:
             self._begin(self._scoring[0], _trained_by(self._scoring[1]), False)
             self._follow()
         self.sites: Dict[Function, List[_Site]] = {runs: list(calls.values()) for runs, calls in self._sites.items()}
-
-    def _is_applied(self, function: Function, call: Optional[ast.Call], names: Set[str], depth: int = 0) -> bool:
-        """Return whether a parameter steps by a gradient, a call's or one of these names: ``p.grad = g``, ``p -= g``.
-
-        It is followed into functions that are given it, callers that get it, and methods of the class that stores it.
-        """
-
-        def has(value: ast.AST) -> bool:
-            return depends(function, value, names, call)
-
-        made = [(each, each.value) for each in function.flow.every_definition if each.value is not None]
-        steps = [value for each, value in made if _is_less(each) or each.place.endswith(".grad")]
-        steps += [arg.value for each in function.flow.calls if _is_downhill(each) for arg in given(each)]
-        if any(has(value) and not any(map(_loses_sign, attribute_chain(value))) for value in steps):
-            return True
-        inner: List[Tuple[Function, Optional[ast.Call], Set[str]]] = []
-        for each in function.flow.calls if depth < _DEPTH else ():
-            for callee in callees(self.program, function, each):
-                taken = [(name, callee.given(each, name)) for name in callee.parameters]
-                inner += [(callee, None, {name}) for name, value in taken if value is not None and has(value)]
-        if depth < _DEPTH and any(map(has, function.flow.returns)):
-            inner += [(caller, site, set()) for caller, site in sure_calls(self.program, function)]
-        owner = self.program.owner_of(function)
-        kept = [(each.place, value) for each, value in made if each.place.startswith("self.") and depth < _DEPTH]
-        stored = {place for place, value in kept if has(value)}
-        others = owner.methods.values() if owner is not None and stored else ()
-        inner += [(method, None, stored) for method in others if method is not function]
-        return any(self._is_applied(*each, depth + 1) for each in inner)
 
     def _follow(self) -> None:
         while self._work:
@@ -223,27 +190,6 @@ class Training:
 
 def _takes_gradient(reference: Reference) -> bool:
     return reference.kind == "external" and str(reference.target).endswith("autograd.grad")
-
-
-def _is_less(made: Definition) -> bool:
-    """Return whether a place becomes less: ``p -= rate * g``, ``p = (p - rate * g).detach()``."""
-    parts = [part for part in attribute_chain(made.value or made.node) if isinstance(part, ast.BinOp)]
-    less = any(isinstance(part.op, ast.Sub) and path_of(part.left) == made.place for part in parts)
-    return less or (isinstance(made.node, ast.AugAssign) and isinstance(made.node.op, ast.Sub))
-
-
-def _loses_sign(node: ast.AST) -> bool:
-    """Return whether it is a size, ``gradient.abs()``: nothing steps by one."""
-    return isinstance(node, ast.Call) and call_name(node) in ("abs", "norm", "square")
-
-
-def _is_downhill(call: ast.Call) -> bool:
-    """Return whether a call may step by its arguments: ``p.add_(g, alpha=-rate)``, no sum: ``scores.add_(g.abs())``."""
-    if call_name(call) == "setattr" and len(given(call)) == 3:
-        return constant(given(call)[1].value) == "grad"
-    signs = [part.op for part in walk_expressions(call) if isinstance(part, ast.UnaryOp)]
-    is_sum = call_name(call) == "add_" and not any(isinstance(sign, ast.USub) for sign in signs)
-    return call_name(call) in APPLIES and not is_sum
 
 
 def _trained_by(call: ast.Call) -> List[ast.expr]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 import re
-from typing import List, Optional, Set
+from typing import List, Set
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.reaching import Reaching
@@ -31,7 +31,6 @@ KEEPS_AXES = _MOVES | LIMITS  # every value keeps its place
 LIKE = word_set("expand_as reshape_as to type_as view_as")  # uses a tensor's type or shape, not its values
 ASKS = word_set("isfinite isinf isnan ones_like zeros_like")  # tests of values
 CONSTANTS = word_set("full full_like ones ones_like zeros zeros_like")  # one value for every pixel
-NEW_TENSORS = CONSTANTS | _MAKES | word_set("Parameter empty eye rand randn")
 SIZES = word_set("device dim dtype is_cuda ndim numel shape size")  # properties that do not depend on the values
 REDUCES = word_set("mean median std sum var")
 EXTREMES = word_set("amax amin max min")
@@ -41,7 +40,6 @@ ENDS_GRADIENT = LEAVES | {"detach"}
 NO_GRAD = word_set("inference_mode no_grad")  # contexts and decorators
 BACKWARD = word_set("backward manual_backward")  # the second is Lightning's
 LOSSES = word_set("loss outputs tensors")  # the keywords of what they take the gradient of
-APPLIES = word_set("add_ copy_ step sub_")  # a parameter changes by what these are given
 LOGARITHMS = word_set("exp log log10 log1p log2")  # of a picture and back: its contours are others
 TRANSFORMS = LOGARITHMS | word_set("maximum minimum pow sigmoid sqrt square tanh")  # no longer an absolute error
 OTHER_LOSSES = word_set("huber_loss mse_loss norm smooth_l1_loss")
@@ -73,8 +71,8 @@ _MIXES = word_set("addcmul bmm lerp matmul mm where")  # an exposure, a backgrou
 KEEPS_PICTURES = PICTURE_FUNCTIONS | TRANSFORMS | _MIXES
 
 
-def depends(function: Function, node: ast.AST, names: Set[str], call: Optional[ast.Call] = None) -> bool:
-    """Return whether an expression of a function depends on the value of one of these names, or of a call there.
+def depends(function: Function, node: ast.AST, names: Set[str]) -> bool:
+    """Return whether an expression of a function depends on the value of one of these names.
 
     What depends on the size alone does not.
     """
@@ -82,9 +80,9 @@ def depends(function: Function, node: ast.AST, names: Set[str], call: Optional[a
     work: List[ast.AST] = [node]
     while work:
         part = work.pop()
-        if part is call or (isinstance(part, (ast.Name, ast.Attribute)) and path_of(part) in names):
-            return True
         if isinstance(part, (ast.Name, ast.Attribute)):
+            if path_of(part) in names:
+                return True
             work.extend(made.value for made in function.flow.reaching(part).new(met) if made.value is not None)
         if not (isinstance(part, ast.Attribute) and part.attr in SIZES):
             work.extend(children(part))

@@ -7,10 +7,7 @@ from typing import List, NamedTuple, Sequence
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import (
-    attribute_chain,
-    call_name,
     code,
-    given,
     indices,
     key_of,
     said_by,
@@ -23,9 +20,7 @@ from legs_adapters.lexicon.masks import is_mask
 from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.ways import PHOTOGRAPH, RENDERING, Ways
-from legs_adapters.lexicon.words import OF_RAYS, STRUCTURAL
-from legs_adapters.tensors.absolute import is_no_picture
-from legs_adapters.tensors.operations import MODULES
+from legs_adapters.lexicon.words import OF_RAYS
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.text import on_one_line
 
@@ -87,25 +82,9 @@ def same_root(form: Form) -> bool:
     return same(a.value, b.value) and not same(a, b)
 
 
-def is_of_numbers(function: Function, side: ast.AST) -> bool:
-    """Return whether a side is a tensor of numbers alone: ``torch.eye(3)``, ``torch.tensor([0.0, 1.0])[:, None]``."""
-    value = function.flow.value_of(side) or side
-    read = {part.id for part in function.flow.reads_in(value)}
-    makes = any(isinstance(part, ast.Call) and call_name(part) in ("eye", "tensor") for part in walk_expressions(value))
-    return is_no_picture(value) or (makes and read <= MODULES | {"None", "device"})
-
-
 def of_rays(form: Form) -> bool:
     """Return whether the names are about rays or a radiance field: lists of colours."""
     return any(OF_RAYS.search(code(node)) for node in (form.first, form.second))
-
-
-def is_beside_ssim(function: Function, first: ast.AST, second: ast.AST) -> bool:
-    """Return whether an SSIM is given the same two, perhaps with another axis: they are images by any name."""
-    calls = [call for call in function.flow.calls if STRUCTURAL.search(call_name(call))]
-    read = [[part for arg in given(call) for part in attribute_chain(arg.value)] for call in calls]
-    goes_on = function.module.spend(len(function.flow.calls) + sum(map(len, read)))
-    return goes_on and any(all(any(same(part, side) for part in parts) for side in (first, second)) for parts in read)
 
 
 def is_role(node: ast.AST) -> bool:

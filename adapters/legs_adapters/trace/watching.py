@@ -206,7 +206,7 @@ class Watch:
             target = -1 if all(moving) else moving.index(False)
             still = sides[1].detach() if target < 0 else sides[target]  # (detached it has no base)
             node.metadata[_KEY] = record = _Record(kind, frames, target, still, made.detach(), [])
-            node.register_hook(functools.partial(_share, record.shares, record.values))
+            node.register_hook(functools.partial(_share, record.shares, record.values, record.values._version))
 
     def _frames(self, sides: Sequence[Any]) -> Tuple[Frame, ...]:
         """Return the frames of the checkout, innermost first, each with its names of the two sides."""
@@ -341,10 +341,11 @@ class Watch:
         return leaf.numel() <= _POSE or (0 < rows <= len(self.photographs) and firsts.count(rows) < 3)
 
 
-def _share(shares: List[Any], values: Any, _: Any, gradients: Sequence[Any]) -> None:
+def _share(shares: List[Any], values: Any, version: int, _: Any, gradients: Sequence[Any]) -> None:
     """Add what a difference contributes to the loss: an L1 is the sum of its gradient times its values."""
     if gradients and gradients[0] is not None and gradients[0].shape == values.shape:
-        shares.append((gradients[0].detach().float() * values.float()).sum())
+        parts = gradients[0].detach().float() * values.float()
+        shares.append((parts if values._version == version else parts.abs()).sum())  # abs_() took the values' signs
 
 
 def _span(frame: Any) -> Tuple[int, ...]:

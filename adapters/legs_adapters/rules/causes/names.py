@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 from typing import TYPE_CHECKING, AbstractSet, List
 
-from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import names_where, root_of, words
 from legs_adapters.lexicon.words import (
     EVALUATING,
@@ -23,7 +21,7 @@ from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
 
 if TYPE_CHECKING:
-    from legs_adapters.rules.analysis import Analysis
+    pass
 
 
 class Tracking(Rule):
@@ -86,20 +84,17 @@ class OtherName(Rule):
         self.__doc__ = str(OtherName.__doc__).format(why=why, name=name)
 
     def evidence(self, term: Term) -> List[Decider]:
-        """Return the first name that has one of the words, unless both sides are proven."""
+        """Return the first name that has one of the words, unless both sides are proven.
+
+        There may be features beside them still, or a threshold taken of an error map.
+        """
         module = term.function.module
         names = [(name, decider) for name, decider in term.names_around if not SPLATS.search(name)]
         file = [(module.path.rpartition("/")[2], header(term.function))]
         names += file if self.words & {*words(file[0][0])} and "gaussian" not in module.text.lower() else []
         found = [decider for name, decider in names if self.words & set(words(name))][:1]
-        return [] if found and term.pair.is_proven and self._is_outweighed(term) else found
-
-    def _is_outweighed(self, term: Term) -> bool:
-        """Return whether it is the plain L1: no threshold may be taken of it, nor features beside it."""
-        if self.id == "robust":
-            return term.form.makes != "none"
-        is_step = term.function in term.analysis.training.roots  # its name says nothing of one term in it
-        return self.id != "perceptual" or is_step or _are_proven(term.analysis, term.function)
+        outweighs = self.id != "perceptual" and (self.id != "robust" or term.form.makes != "none")
+        return [] if outweighs and term.pair.is_proven else found
 
     def may_be_loss(self, term: Term) -> bool:
         """Return whether the name may mean something else: it is reported where no other term was found."""
@@ -112,12 +107,6 @@ NAMES = (
     OtherName("mesh", "mesh", MESH, "A name is of a mesh: nothing proves that Gaussians are drawn.", "train_texture"),
     OtherName("robust", "huber", ROBUST, "A name is of a robust loss: a weight may move its threshold.", "huber"),
 )
-
-
-@functools.lru_cache(maxsize=1)
-def _are_proven(analysis: Analysis, function: Function) -> bool:
-    """Return whether both sides of each term of a function are proven."""
-    return all(Term(analysis, function, form).pair.is_proven for form in analysis.forms.in_function(function))
 
 
 def _is_of_tracking(name: str) -> bool:

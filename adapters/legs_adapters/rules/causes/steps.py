@@ -32,25 +32,6 @@ class PoseStep(_ByPurpose):
     reason = "tracking"
 
 
-class OtherStep(_ByPurpose):
-    """No Gaussians were found in the optimiser, which has new tensors alone, though some are drawn.
-
-    skipped:
-        def fit(gaussians, camera, num_parts):
-            part_deltas = torch.nn.Parameter(torch.zeros(num_parts, 6))
-            optimizer = torch.optim.Adam([part_deltas], lr=0.001)
-            image = render(camera, gaussians.moved(part_deltas), None, None)["render"]
-            l1_loss(image, camera.original_image).backward()
-            optimizer.step()
-    """
-
-    id = "other-step"
-    reason = "tracking"
-
-    def may_be_loss(self, term: Term) -> bool:
-        return True
-
-
 class NoStep(_ByPurpose):
     """No optimiser was found that uses the gradients: what only reads them scores the Gaussians.
 

@@ -10,7 +10,7 @@ from legs_adapters.lexicon.words import BACKGROUND, COLORS, KIND_OF
 from legs_adapters.rules.rule import Rule, Term
 from legs_adapters.tensors.absolute import is_no_picture, sides_of
 from legs_adapters.terms.findings import Decider
-from legs_adapters.terms.sides import is_beside_ssim, same_root, speaks_of_images
+from legs_adapters.terms.sides import same_root, speaks_of_images
 
 
 class Unknown(Rule):
@@ -41,7 +41,7 @@ class Unknown(Rule):
         pictures = "image" in (pair.a.kind, pair.b.kind)
         if pictures and "render" not in (pair.a.role, pair.b.role):  # two colours may be of Gaussians
             named = {word for word in words_in(*term.sides) if KIND_OF.get(word) == "image"}
-            pictures = not named or bool(named - COLORS) or is_beside_ssim(term.function, *term.sides)
+            pictures = not named or bool(named - COLORS)
         sure = swapped(pair.a, pair.b) is not None or all(map(speaks_of_images, (pair.first, pair.second)))
         changes = same_root(term.form) or all(map(sides_of, term.sides))  # of two views, or of neighbours
         changes = changes or any(map(is_no_picture, term.sides))  # the error of an error, of angles; darkness

@@ -92,6 +92,12 @@ def test_terms_in_words_and_terms_with_a_line_are_both_tried(tmp_path):
     assert advised.count(False) >= 1
 
 
+def test_a_side_of_numbers_is_no_photograph(tmp_path):
+    found = plan(checkout(tmp_path, files("masked_target_weighted_mask_left"))).findings
+    of_numbers = [p.advice for p in found.problems if re.search(r"plain|shift|torch\.tensor", p.reason)]
+    assert of_numbers == ["leave it: it compares with no photograph"] * 3
+
+
 @pytest.mark.skipif(sys.version_info < (3, 9), reason="ast.unparse is of Python 3.9")
 def test_a_line_that_loses_its_mask_is_found(tmp_path, monkeypatch):
     start_run(monkeypatch, tmp_path)

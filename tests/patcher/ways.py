@@ -50,6 +50,18 @@ OF_GRAD = (
 """
 )
 
+DESCENT = (
+    LOOP
+    + """
+    loss = F.l1_loss(image, gt_image)  # <- here
+    leaves = [splats.xy, splats.colour, splats.opacity]
+    gradients = torch.autograd.grad(loss, leaves)
+    with torch.no_grad():
+        for leaf, gradient in zip(leaves, gradients):
+            leaf -= 0.01 * gradient
+"""
+)
+
 AUTOCAST = (
     LOOP
     + """
@@ -233,6 +245,7 @@ WAYS = {
     "gradients accumulated over steps": (ACCUMULATED, []),
     "several backward passes a step": (SEVERAL, []),
     "autograd.grad": (OF_GRAD, []),
+    "autograd.grad, stepped by hand": (DESCENT, []),
     "autocast": (AUTOCAST, []),
     "checkpointing": (CHECKPOINTED, []),
     "accelerate": (ACCELERATE, ["accelerate"]),

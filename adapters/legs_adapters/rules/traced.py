@@ -141,7 +141,7 @@ class _Join:
         if read is not None:
             self.settled.add(read[:3])
         own = [c for c in stack if (c.function.module.path, c.function.name) not in self.trace.scripted]
-        is_read = any(self.analysis.training.scores(candidate.form.node) for candidate in own)
+        is_read = traced.is_read and not all(term.is_read for term in self.trace.terms)
         why = "nothing shows that its gradient is more than read" if is_read else ""
         advice = "give the term of the photograph a line of its own, legs_loss.l1_loss(rendering, photograph)"
         if traced.largest > SURELY_NOT_UNIT_RANGE:  # legs_loss would refuse it in the first step

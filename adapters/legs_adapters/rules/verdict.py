@@ -37,7 +37,7 @@ from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import PassedByName
 from legs_adapters.terms.kinds.indirect import Indirect
 from legs_adapters.terms.kinds.reread import Reread
-from legs_adapters.terms.sides import is_role, same_root
+from legs_adapters.terms.sides import is_of_numbers, is_role, same_root
 from legs_adapters.terms.text import Text
 
 _OF_DIFFERENCE = "as one absolute difference times the photograph's weight map, with each mask and threshold as it is"
@@ -148,6 +148,8 @@ class Verdicts:
         if term.has_rows:
             why = "the sides are lists of pixels: a weight map needs whole images"
             return _ByHand(why, "weight the L1 of the whole images, before pixels are picked or flattened")
+        if any(is_of_numbers(term.function, side) for side in term.sides):
+            return _ByHand("a side is made of numbers", "leave it: it compares with no photograph")
         if isinstance(term.form, Indirect) and term.form.difference is not None:
             why = f"{one_line(term.form.difference)} may change before its absolute value is taken"
             return _ByHand(why, _OF_DIFFERENCE)

@@ -7,6 +7,7 @@ from typing import List, NamedTuple, Sequence
 
 from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import (
+    call_name,
     code,
     indices,
     key_of,
@@ -21,6 +22,8 @@ from legs_adapters.lexicon.meaning import Meaning
 from legs_adapters.lexicon.names import kind_of_words, role_of_words
 from legs_adapters.lexicon.ways import PHOTOGRAPH, RENDERING, Ways
 from legs_adapters.lexicon.words import OF_RAYS
+from legs_adapters.tensors.absolute import is_no_picture
+from legs_adapters.tensors.operations import MODULES
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.text import on_one_line
 
@@ -80,6 +83,14 @@ def same_root(form: Form) -> bool:
     if not (isinstance(a, ast.Subscript) and isinstance(b, ast.Subscript)) or isinstance(key_of(a), str):
         return False
     return same(a.value, b.value) and not same(a, b)
+
+
+def is_of_numbers(function: Function, side: ast.AST) -> bool:
+    """Return whether a side is a tensor of numbers alone: ``torch.eye(3)``, ``torch.tensor([0.0, 1.0])[:, None]``."""
+    value = function.flow.value_of(side) or side
+    read = {part.id for part in function.flow.reads_in(value)}
+    makes = any(isinstance(part, ast.Call) and call_name(part) in ("eye", "tensor") for part in walk_expressions(value))
+    return is_no_picture(value) or (makes and read <= MODULES | {"None", "device"})
 
 
 def of_rays(form: Form) -> bool:

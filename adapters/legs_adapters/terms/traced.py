@@ -38,6 +38,7 @@ class Traced(NamedTuple):
         parameters, stepped: names and shapes of what is stepped after it.
         steps, poses: how many steps moved more than poses, exposures and embeddings; and how many only those.
         is_picture: whether that side is a picture of three or four channels.
+        is_read: whether its gradient is of torch.autograd.grad, and was the ``grad`` of no leaf that was stepped.
         passes: under which losses it lay, by their numbers from 1.
     """
 
@@ -56,6 +57,7 @@ class Traced(NamedTuple):
     steps: int
     poses: int
     is_picture: bool
+    is_read: bool = False
     passes: FrozenSet[int] = frozenset()
 
     @classmethod

@@ -117,6 +117,7 @@ class Watch:
         self.scripted: Set[Tuple[str, str]] = set()  # files and names of functions of TorchScript: nothing is edited
         self._waiting: Dict[Any, Set[int]] = {}  # terms whose step is awaited, with the ids of the leaves under each
         self._samples: Dict[int, _Sample] = {}
+        self._taken: Dict[Any, List[Any]] = {}  # weak references to the gradients that a pass returned for a term
         self.optimisers: Any = weakref.WeakSet()
         self._inside = False
 
@@ -245,7 +246,7 @@ class Watch:
                 self.times.append(time.process_time())
             seen = self._seen(roots) or []
             gradients = own(tensors, *args, **kwargs)
-            self._sum_up(roots, seen, len(self.seen["losses"]) if is_loss else 0)
+            self._sum_up(roots, seen, len(self.seen["losses"]) if is_loss else 0, gradients)
             return gradients
 
         return watched
@@ -283,12 +284,13 @@ class Watch:
             "frames": record.frames, "kind": kind, "target": record.target, "shape": list(record.still.shape),
             "is_picture": picture is not None, "match": match and match._asdict(), "is_known": known is not None,
             "largest": 0.0 if picture is None else float(record.still.detach().nan_to_num().abs().max()),
-            "is_rival": False, "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
+            "is_rival": False, "is_read": True,
+            "shares": [], "steps": 0, "gaussians": 0, "parameters": [], "stepped": [], "poses": 0,
         })  # fmt: skip
         return key, match, as_planes(record.still) if whole is None else whole
 
     @_harmless
-    def _sum_up(self, roots: Sequence[Any], seen: Sequence[Tuple[_Record, Any, List[Any]]], at: int) -> None:
+    def _sum_up(self, roots: Any, seen: Sequence[Tuple[_Record, Any, List[Any]]], at: int, gradients: Any) -> None:
         self.seen["backward_passes"] += 1
         loss = sum(float(root.detach().sum()) for root in roots)
         for record, key, leaves in seen:
@@ -296,6 +298,8 @@ class Watch:
                 continue  # its gradient was not asked for
             share = sum(float(part) for part in record.shares) / (loss or 1.0)
             self.terms[key]["shares"].append((at, share / 2 if self.terms[key]["kind"] == "squared" else share))
+            self.terms[key]["is_read"] &= gradients is not None  # of torch.autograd.grad, until a leaf has one
+            self._taken[key] = [weakref.ref(each) for each in gradients or () if each is not None]
             self._waiting.setdefault(key, set()).update(map(id, leaves))
             for leaf in leaves:
                 if id(leaf) not in self._samples or self._samples[id(leaf)].leaf() is not leaf:
@@ -313,8 +317,10 @@ class Watch:
         stepped: List[bool] = []
         for key, leaves in list(self._waiting.items()):
             if leaves & changed:
-                leaves = leaves & changed
-                stepped.append(self._stepped(self.terms[key], [self._samples[at].leaf() for at in leaves]))
+                moved = [self._samples[at].leaf() for at in leaves & changed]
+                own = [leaf.grad for leaf in moved if leaf.grad is not None]
+                self.terms[key]["is_read"] &= not any(taken() is each for taken in self._taken[key] for each in own)
+                stepped.append(self._stepped(self.terms[key], moved))
                 del self._waiting[key]
         awaited = set().union(*self._waiting.values()) - changed
         self._samples = {at: each for at, each in self._samples.items() if at in awaited and each.leaf() is not None}

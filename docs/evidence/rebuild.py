@@ -164,11 +164,18 @@ def schedule(iteration: int) -> str:
         for row in rows:
             row["metrics"]["iterations"] = iteration  # a summary has milliseconds by it
         for scene in sorted({row["scene"] for row in rows}):
-            for one in summarise_all([row for row in rows if row["scene"] == scene], SCHEDULE_ARMS):
-                lines.append(
-                    [f"{scene}, {machine}", one.arm, *(_schedule_cell(one, label) for label in SCHEDULE_COLUMNS)]
-                )
+            for place, some in _by_seeds([row for row in rows if row["scene"] == scene], f"{scene}, {machine}"):
+                for one in summarise_all(some, SCHEDULE_ARMS):
+                    lines.append([place, one.arm, *(_schedule_cell(one, label) for label in SCHEDULE_COLUMNS)])
     return compact(["capture", "arm", *SCHEDULE_COLUMNS], lines)
+
+
+def _by_seeds(rows: List[Any], place: str) -> List[Tuple[str, List[Any]]]:
+    """Return the rows as one group; by seed where not all arms have the same seeds, so that equals are compared."""
+    seeds = {row["seed"] for row in rows}
+    if len({(row["arm"], row["seed"]) for row in rows}) == len({row["arm"] for row in rows}) * len(seeds):
+        return [(place, rows)]
+    return [(f"{place}, seed {seed}", [row for row in rows if row["seed"] == seed]) for seed in sorted(seeds)]
 
 
 def papers() -> str:

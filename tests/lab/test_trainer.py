@@ -91,6 +91,14 @@ def test_weights_come_from_the_store_only_for_the_very_image(scene: Scene, tmp_p
     assert load_dataset(scene, PRESETS["3dgs"], store=tmp_path).train[0].weight is None
 
 
+def test_photographs_that_are_enlarged_are_said(scene: Scene, capsys: pytest.CaptureFixture[str]) -> None:
+    load_dataset(scene, PRESETS["3dgs"], 64)
+    assert capsys.readouterr().err == ""
+    assert load_dataset(scene, PRESETS["3dgs"], 80).train[0].camera.width == 80
+    said = "legs-loss: warning: the photographs are 64 wide, and -r enlarges them to 80\n"
+    assert capsys.readouterr().err == said
+
+
 def with_masks(scene: Scene, folder: Path, kind: str = "masks") -> Path:
     """Make a store in which the left quarter of each view but the last is left out, or weighs 0 of 1."""
     (folder / kind).mkdir()

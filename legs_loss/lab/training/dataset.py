@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Iterable, List, NamedTuple, Optional, Tuple
@@ -13,9 +14,10 @@ from torch import Tensor
 from legs_loss.config import STORE_FOLDER
 from legs_loss.errors import LegsError
 from legs_loss.precompute.photograph import levels_of
-from legs_loss.scenes import Camera, Scene, View, image_tensor, load_training_image
+from legs_loss.scenes import Camera, Scene, View, image_size, image_tensor, load_training_image
 from legs_loss.spec import Spec, WeightSpec, as_spec
 from legs_loss.store import Found, WeightStore
+from legs_loss.system.terminal import say
 from legs_loss.weights import weight_map
 
 HOLD_OUT = 8  # every 8th view, sorted by name, as usual for 3DGS
@@ -79,7 +81,7 @@ def load_dataset(
     white_background: bool = False,
     store: Optional[Path] = None,
 ) -> Dataset:
-    """Load every view of a scene.
+    """Load every view of a scene, and say where that enlarges the photographs.
 
     Args:
         scene: with cameras.
@@ -94,9 +96,11 @@ def load_dataset(
         LegsError: a view has no pinhole camera, a photograph cannot be read, or the store has masks or weights of the
             user's, and does not know a photograph.
     """
-    train, test = (
-        [load_view(scene, view, resolution, white_background) for view in views] for views in split_views(scene)
-    )
+    views = split_views(scene)
+    train, test = ([load_view(scene, view, resolution, white_background) for view in some] for some in views)
+    wide, trained = image_size(views[0][0].path)[0], train[0].camera.width
+    if trained > wide:
+        say(f"legs-loss: warning: the photographs are {wide} wide, and -r enlarges them to {trained}", sys.stderr)
     opened = open_store(scene, store)
     if not spec.unweighted:
         train = [replace(view, weight=weight) for view, weight in zip(train, _weights(opened, train, spec))]

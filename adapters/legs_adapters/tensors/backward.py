@@ -50,9 +50,8 @@ class Training:
         scoring: List[_Site] = []
         for module in program.matching(TRAINS):
             for function in module.scopes(TRAINS.search):
-                grads = [call for call in function.flow.calls if self._is_grad(function, call)]
                 passes = [call for call in function.flow.calls if is_backward(call)]
-                scoring += [(function, call) for call in grads]
+                scoring += [(function, call) for call in function.flow.calls if self._is_grad(function, call)]
                 self._begin(function, [value for call in passes for value in _trained_by(call)], bool(passes))
         for method in (method for name in sorted(HOOKS) for method in program.methods_named(name)):
             self._begin(method, method.flow.returns, True)

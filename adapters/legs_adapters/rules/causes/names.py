@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, AbstractSet, List
+from typing import AbstractSet, List
 
 from legs_adapters.code.syntax import names_where, root_of, words
 from legs_adapters.lexicon.words import (
@@ -19,9 +19,6 @@ from legs_adapters.lexicon.words import (
 )
 from legs_adapters.rules.rule import Rule, Term, header
 from legs_adapters.terms.findings import Decider
-
-if TYPE_CHECKING:
-    pass
 
 
 class Tracking(Rule):

@@ -72,6 +72,14 @@ def test_the_tables_of_the_evidence_are_those_of_its_rows() -> None:
     assert rebuild["captures"]() == (ROOT / "docs/evidence/captures.md").read_text(encoding="utf-8")
 
 
+def test_arms_of_other_seeds_stand_apart_in_a_table_of_the_schedule() -> None:
+    by_seeds = runpy.run_path(str(ROOT / "docs" / "evidence" / "rebuild.py"))["_by_seeds"]
+    both = [{"arm": arm, "seed": seed} for arm in ("3dgs", "legs") for seed in (0, 1)]
+    assert by_seeds(both, "fox, CPU") == [("fox, CPU", both)]
+    first, second = [both[0], both[2]], [both[1]]
+    assert by_seeds(both[:3], "fox, CPU") == [("fox, CPU, seed 0", first), ("fox, CPU, seed 1", second)]
+
+
 @pytest.mark.parametrize("machine", ["cpu", "gpu"])
 def test_the_rows_of_a_run_are_taken_in_the_place_of_its_earlier_ones(machine: str, tmp_path: Path) -> None:
     copy = tmp_path / "evidence"

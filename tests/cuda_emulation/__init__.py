@@ -6,6 +6,7 @@ GPU, and the kernels that it launches are legs.cu, compiled for the CPU.
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import shlex
 import shutil
@@ -59,6 +60,7 @@ class Libraries(NamedTuple):
 def libraries(flags: Sequence[str] = ()) -> Libraries:
     """Compile the two libraries, once in a process; ``flags`` are for g++ when it compiles kernels."""
     folder = Path(tempfile.mkdtemp(prefix="legs-emulated-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     found = []
     for name in ("libcuda", "libnvrtc"):
         path = folder / f"{name}.so"

@@ -12,6 +12,7 @@ from legs_adapters.trace.photographs import SURE, Photographs, is_another, thumb
 from PIL import Image
 
 SIZE = 96, 128
+GROUNDS = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.3, 0.9, 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +66,36 @@ class TestAnother:
         assert is_another(((0.5 * photograph + 0.5 * soft) * 255).round() / 255, photograph)
 
 
+def covers():
+    """Return masks [H, W] that are 0 at a border, at random blocks and points, or outside of a disc."""
+    generator = torch.Generator().manual_seed(1)
+    rows, columns = torch.meshgrid(*(torch.linspace(-1, 1, n) for n in SIZE), indexing="ij")
+    blocks = F.interpolate((torch.rand(1, 1, 12, 12, generator=generator) < 0.6).float(), size=SIZE)
+    return {
+        "border": ((rows.abs() < 0.97) & (columns.abs() < 0.97)).float(),
+        "blocks": blocks[0, 0],
+        "points": (torch.rand(SIZE, generator=generator) < 0.98).float(),
+        "disc": (rows**2 + columns**2 < 0.5).float(),
+    }
+
+
 class TestFiles:
+    @pytest.mark.parametrize(
+        ("cover", "ground"),
+        [(cover, ground) for cover in covers() for ground in GROUNDS if (cover, ground) != ("border", GROUNDS[-1])],
+    )  # (a border of a colour is not known: no cell is of it alone)
+    def test_a_photograph_on_a_ground_is_its_files_and_another_one_is_not(self, photograph, tmp_path, cover, ground):
+        save(photograph, tmp_path / "images/0.png")
+        save(photograph.flip(2), tmp_path / "images/1.png")
+        mask = covers()[cover]
+        laid, other = (
+            p * mask + torch.tensor(ground)[:, None, None] * (1 - mask) for p in (photograph, photograph.flip(1))
+        )
+        photographs = Photographs([str(tmp_path)])
+        found = photographs.match(thumbnail(laid))
+        assert found.path == "images/0.png" and found.correlation >= 0.99 and found.is_photograph
+        assert photographs.match(thumbnail(other)).correlation < SURE
+
     def test_a_grey_copy_is_no_photograph_unless_the_file_is_grey(self, photograph, tmp_path):
         coloured = 0.9 * photograph[:1].expand(3, -1, -1) + 0.1 * photograph
         grey = coloured.mean(0, keepdim=True).expand(3, -1, -1)

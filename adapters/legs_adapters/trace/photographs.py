@@ -10,11 +10,12 @@ from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 from legs_loss import LegsError
 
-SIDE = 16  # pixels of a thumbnail
+SIDE = 16  # cells of a thumbnail
+_FINE = 4  # parts of a cell, each way
+_MOST = SIDE * _FINE
 SURE = 0.94  # the correlation from which on a picture is a file's
-DETAIL = 0.6  # that of what thumbnails four times as large have beside it: less is a rendering, or another view
+DETAIL = 0.6  # that of what the parts of cells have beside it: less is a rendering, or another view
 MAX_FILES = 4000
-Picture = Tuple[Any, Any, Optional[Any], Tuple[int, ...]]
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm")
 _OTHER = re.compile(  # the words of a folder, or of a file's name, whose pictures are no photographs
     r"(?i)(^|[^a-z])(normals?|nrm|depths?|disp|disparity|masks?|seg|segmentations?|semantics?|labels?|flow|edges?|"
@@ -24,6 +25,14 @@ _PHOTOS = re.compile(r"(?i)(^|[^a-z])(images?|rgb|colou?rs?|photos?|photographs?
 _GREY = 0.1  # the part of a file's colours from which on a picture is no grey copy of it
 
 _EQUAL, _REST = 0.2, 0.005  # equal pixels of a part of a photograph; the variance that an exposure leaves, at most
+
+
+class Picture(NamedTuple):
+    """The means of the parts of a picture's cells [3, 256, 16], which of them are no background, and its size."""
+
+    parts: Any
+    kept: Any
+    size: Tuple[int, int]
 
 
 class Match(NamedTuple):
@@ -81,43 +90,25 @@ class Photographs:
             best = max(found, key=lambda match: match.correlation, default=None)
         if best is None or best.correlation < SURE:
             return best
-        path = os.path.join(self.root, best.path)
-        detail = self._detail(path, picture)
+        parts, kept, size = picture
+        file = _thumbnails((os.path.join(self.root, best.path),), size)[1]
+        is_small = min(size) < 2 * SIDE  # without detail
+        detail = 1.0 if is_small else float(_likeness(_high(parts, kept), _high(file, kept))[0])
         if detail < DETAIL:
             return best._replace(correlation=min(best.correlation, SURE * max(detail, 0.0)))
-        kept = picture[1]
-        most = max(_colours(thumb[:, kept]) for thumb in _thumbnails((path,))[1])
-        is_grey = _colours(picture[0][:, kept]) + 1e-4 < _GREY * most
+        is_grey = _colours(_cells(parts, kept)) + 1e-4 < _GREY * _colours(_cells(file, kept)[0])
         return best._replace(detail=detail, is_photograph=best.is_photograph and not is_grey)
-
-    def _detail(self, path: str, picture: Picture) -> float:
-        """Return the correlation with a file's detail; 1 where the picture is too small to have any."""
-        import numpy as np
-
-        kept, fine = picture[1:3]
-        if fine is None:
-            return 1.0
-        scale = round((fine.shape[1] / kept.size) ** 0.5)
-        inside = kept.reshape(SIDE, SIDE).repeat(scale, 0).repeat(scale, 1).ravel()
-        one = _standardised(fine[:, inside]).ravel()
-        scores = [_standardised(_high(other, scale)[:, inside]) for other in _thumbnails((path,), scale * SIDE)[1]]
-        return max((float(np.dot(score[::way].ravel(), one)) for score in scores for way in (1, -1)), default=0.0)
 
     def _best(self, tier: int, picture: Picture) -> Optional[Match]:
         import numpy as np
 
-        files, stack = _thumbnails(tuple(self._tiers[tier]))  # [F], [F, 3, 256]
-        thumb, kept, _, shape = picture
-        if not len(files) or kept.sum() < 16:
+        parts, kept, size = picture
+        files, stack = _thumbnails(tuple(self._tiers[tier]), size)
+        if not files:
             return None
-        one = _standardised(thumb[:, kept])
-        if min(shape) < SIDE:  # the files as coarse as the picture is
-            rows, columns = (_areas(n) @ _areas(SIDE, n) if n < SIDE else np.eye(SIDE) for n in shape)
-            stack = (rows @ stack.reshape(-1, 3, SIDE, SIDE) @ columns.T).reshape(stack.shape)
-        others = _standardised(stack[:, :, kept])
-        scores = np.maximum(others @ one.ravel(), others @ one[::-1].ravel())  # RGB, BGR
+        scores = _likeness(_cells(parts, kept), _cells(stack, kept))
         at = int(np.argmax(scores))
-        return Match(os.path.relpath(self._tiers[tier][files[at]], self.root), float(scores[at]), not tier)
+        return Match(os.path.relpath(files[at], self.root), float(scores[at]), not tier)
 
 
 def _colours(thumb: Any) -> float:
@@ -125,18 +116,18 @@ def _colours(thumb: Any) -> float:
     return float((thumb - thumb.mean(0)).std())
 
 
-def _standardised(thumbs: Any) -> Any:
-    """Return thumbnails [..., 3, K] without their channels' means, of norm 1; several as rows."""
+def _likeness(picture: Any, files: Any) -> Any:
+    """Return the correlations of a picture [3, k] with those of files [F, 3, k], in RGB or BGR."""
     import numpy as np
 
-    centred = thumbs - thumbs.mean(-1, keepdims=True)
-    norm = np.sqrt((centred**2).sum((-1, -2), keepdims=True))
-    found = centred / np.maximum(norm, 1e-3)
-    return found.reshape(len(found), -1) if found.ndim == 3 else found
+    centred = [each - each.mean(-1, keepdims=True) for each in (picture, files)]
+    one, others = (each / np.maximum(np.sqrt((each**2).sum((-1, -2), keepdims=True)), 1e-3) for each in centred)
+    others = others.reshape(len(others), -1)
+    return np.maximum(others @ one.ravel(), others @ one[::-1].ravel())
 
 
 def thumbnail(picture: Any) -> Optional[Picture]:
-    """Return a picture's thumbnail [3, 256] in [0, 1] or so, what is no flat background, its detail, its size.
+    """Return a picture's means over parts of its cells, and which have nothing of a background of one colour.
 
     Args:
         picture: a tensor, [3, H, W], [H, W, 3], or of such a batch; of one of four channels the first three. Of a batch
@@ -145,6 +136,7 @@ def thumbnail(picture: Any) -> Optional[Picture]:
     Returns:
         None for what is no picture of three or four channels.
     """
+    import numpy as np
     import torch
     from torch.nn.functional import adaptive_max_pool2d, max_pool2d
 
@@ -153,30 +145,52 @@ def thumbnail(picture: Any) -> Optional[Picture]:
         return None
     with torch.no_grad(), torch.autocast(image.device.type, enabled=False):
         image = torch.nan_to_num(image[:3].float())
-        scale = min(4, min(image.shape[1:]) // SIDE)
-        pool, fine = _pooled(image, SIDE), _pooled(image, scale * SIDE) if scale > 1 else None
-        flat = (adaptive_max_pool2d(image, SIDE) + adaptive_max_pool2d(-image, SIDE)).amax(0, keepdim=True) < 1e-6
-        near = max_pool2d(flat.float(), 3, 1, 1) > 0  # the cells at its border have a part of it
-    kept = (~near if int((~near).sum()) >= 16 else ~flat).cpu().numpy().ravel()
-    return pool, kept, None if fine is None else _high(fine, scale), tuple(image.shape[1:])
+        high, low = adaptive_max_pool2d(image, SIDE), -adaptive_max_pool2d(-image, SIDE)
+        flat = high[:, (high - low).amax(0) < 1e-6]  # the colours of cells of one colour
+        ground = flat.median(1).values[:, None, None] if flat.numel() else image.new_zeros(1)
+        equal = [((image - each).abs() < 1e-6).all(0) for each in (image.new_zeros(1), image.new_ones(1), ground)]
+        near = max_pool2d(torch.stack(equal).any(0)[None].float(), 3, 1, 1)  # and what is blurred at its border
+        parts, kept = _pooled(image), _pooled(near)[0] < 1e-6
+    size = min(image.shape[1], _MOST), min(image.shape[2], _MOST)
+    return Picture(parts, kept if _inside(kept).sum() >= 16 else np.ones_like(kept), size)
 
 
-def _pooled(image: Any, side: int) -> Any:
-    """Return the means over equal parts of an image [3, H, W], as an array [3, side * side]."""
+def _pooled(image: Any) -> Any:
+    """Return the means over the parts of the cells of an image [C, H, W], as an array [C, 256, 16]."""
+    parts = _resampled(image, (_MOST, _MOST)).reshape(len(image), SIDE, _FINE, SIDE, _FINE)
+    return parts.transpose(2, 3).reshape(len(image), SIDE**2, _FINE**2).cpu().numpy()
+
+
+def _resampled(image: Any, size: Tuple[int, int]) -> Any:
+    """Return the means over equal parts of an image [C, H, W], exact at their borders."""
     import torch
 
-    rows, columns = (torch.as_tensor(_areas(n, side), device=image.device) for n in image.shape[1:])
-    return (rows @ image @ columns.t()).reshape(3, -1).cpu().numpy().astype("float64")
+    both = zip(image.shape[1:], size)
+    rows, columns = (torch.as_tensor(_areas(count, side), device=image.device) for count, side in both)
+    return rows @ image @ columns.t()
 
 
-def _high(thumb: Any, scale: int) -> Any:
-    """Return a large thumbnail [3, n] without its means over cells of that many pixels."""
-    cells = thumb.reshape(3, SIDE, scale, SIDE, scale)
-    return (cells - cells.mean((2, 4), keepdims=True)).reshape(3, -1)
+def _inside(kept: Any) -> Any:
+    """Return the cells of which at least half is kept."""
+    return kept.mean(-1) >= 0.5
 
 
-def _areas(count: int, side: int = SIDE) -> Any:
-    """Return the weights [side, count] of the means over equal parts of a row of pixels, exact at their borders."""
+def _cells(parts: Any, kept: Any) -> Any:
+    """Return the means [..., k] of what is kept of the cells of which at least half is."""
+    import numpy as np
+
+    weights = kept / np.maximum(kept.sum(-1, keepdims=True), 1)
+    return np.einsum("...cp,cp->...c", parts, weights.astype(parts.dtype))[..., _inside(kept)]
+
+
+def _high(parts: Any, kept: Any) -> Any:
+    """Return what is kept of parts [..., 256, 16], without the means of their cells, as [..., k]."""
+    inside = _inside(kept)
+    return (parts[..., inside, :] - _cells(parts, kept)[..., None])[..., kept[inside]]
+
+
+def _areas(count: int, side: int) -> Any:
+    """Return the weights [side, count] of the means over equal parts of a row of pixels."""
     import numpy as np
 
     edges = np.linspace(0, count, side + 1)
@@ -256,25 +270,19 @@ def _key(path: str) -> Tuple[str, str]:
 
 
 @functools.lru_cache(maxsize=None)
-def _thumbnails(files: Tuple[str, ...], side: int = SIDE) -> Tuple[Any, Any]:
-    """Return the indices of the files that could be read, and thumbnails; of one with alpha on black and white too."""
+def _thumbnails(files: Tuple[str, ...], size: Tuple[int, int]) -> Tuple[Sequence[str], Any]:
+    """Return the files that could be read, and their parts [F, 3, 256, 16], as coarse as a picture of that size."""
     import numpy as np
     import torch
     from PIL import Image
 
-    indices, thumbs = [], []
-    for at, path in enumerate(files):
+    found: Dict[str, Any] = {}
+    for path in files:
         try:
             with Image.open(path) as image:
-                image.draft("RGB", (16 * SIDE, 16 * SIDE))  # of a JPEG: decoded smaller
-                pictures = [image.convert("RGB")]
-                for ground in ("black", "white") if image.mode in ("RGBA", "LA", "PA") else ():
-                    pixels = image.convert("RGBA")
-                    behind = Image.new("RGBA", pixels.size, ground)
-                    pictures.append(Image.alpha_composite(behind, pixels).convert("RGB"))
+                image.draft("RGB", (4 * _MOST, 4 * _MOST))  # of a JPEG: decoded smaller
+                pixels = torch.as_tensor(np.array(image.convert("RGB"), np.float32)).permute(2, 0, 1) / 255
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             continue
-        for picture in pictures:
-            indices.append(at)
-            thumbs.append(_pooled(torch.as_tensor(np.array(picture, np.float32)).permute(2, 0, 1) / 255, side))
-    return np.asarray(indices, int), np.asarray(thumbs).reshape(-1, 3, side * side)
+        found[path] = _pooled(_resampled(pixels, size))
+    return list(found), np.stack(list(found.values())) if found else None

@@ -50,6 +50,10 @@ OF_GRAD = (
 """
 )
 
+OF_FUNCTION = "\ndef objective(image, gt_image):\n    return F.l1_loss(image, gt_image)  # <- here\n" + OF_GRAD.replace(
+    "F.l1_loss(image, gt_image)  # <- here", "objective(image, gt_image)"
+)
+
 DESCENT = (
     LOOP
     + """
@@ -245,6 +249,7 @@ WAYS = {
     "gradients accumulated over steps": (ACCUMULATED, []),
     "several backward passes a step": (SEVERAL, []),
     "autograd.grad": (OF_GRAD, []),
+    "autograd.grad of a function": (OF_FUNCTION, []),
     "autograd.grad, stepped by hand": (DESCENT, []),
     "autocast": (AUTOCAST, []),
     "checkpointing": (CHECKPOINTED, []),

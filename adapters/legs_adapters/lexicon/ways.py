@@ -33,6 +33,8 @@ class Ways(Meanings):
             call = CallReading(self.program, function, node, self.meaning)
             if RENDERERS & set(words(call.name)) and not self._draws_splats(function, node):
                 return meaning_returned(call) or UNKNOWN
+            if call.name == "grid_sample":
+                return UNKNOWN  # one view warped into another, perhaps
             known = meaning_returned(call) or meaning_of_call(call, by_arguments=False)
             is_method = known == UNKNOWN and isinstance(node.func, ast.Attribute)
             return self._member(function, node.func, call.name) if is_method else known  # type: ignore[arg-type]

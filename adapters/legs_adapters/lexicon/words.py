@@ -90,7 +90,7 @@ DATA = CAMERAS | word_set(
     "data batch sample item items datum info infos keyframe frame dataset input inputs entry"
 )  # what holds photographs
 POSES = _CAMERA | word_set("pose poses so se extrinsic extrinsics camtoworld camtoworlds tracking")
-EMBEDDING = word_set("embedding embeddings")
+EMBEDDING = word_set("embedding embeddings exposure exposures")
 GAUSSIANS = word_set("gaussian gaussians gs splat splats")
 TENSORS = word_set(
     """

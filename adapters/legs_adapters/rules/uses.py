@@ -16,7 +16,7 @@ from legs_adapters.rules.causes.kinds import KINDS
 from legs_adapters.rules.order import RULES
 from legs_adapters.rules.rule import Term
 from legs_adapters.terms.findings import Evidence, Use
-from legs_adapters.terms.sides import surest
+from legs_adapters.terms.sides import surest, without_shared_factors
 
 _Call = Tuple[Function, ast.Call, List[Optional[ast.expr]]]
 _DEPTH = 3  # functions that hand on what they are given
@@ -25,8 +25,8 @@ _DEPTH = 3  # functions that hand on what they are given
 def uses_of(analysis: Analysis, term: Term) -> List[Use]:
     """Classify the calls, in the training step, of a function that compares two pictures."""
     found: List[Use] = []
-    function, target = term.function, term.target
-    names = [side.id for side in (term.prediction, target) if isinstance(side, ast.Name)]
+    function, (prediction, target) = term.function, without_shared_factors(term.prediction, term.target)
+    names = [side.id for side in (prediction, target) if isinstance(side, ast.Name)]
     is_given = isinstance(target, ast.Name) and target.id in function.parameters
     for caller, call, sides in _calls(analysis, function, names):
         image = sides[-1] if is_given else None
@@ -41,7 +41,8 @@ def uses_of(analysis: Analysis, term: Term) -> List[Use]:
             other = _why_other(analysis, caller, call, given, is_rendered(analysis, caller, image))
             is_loss = given[0].kind == "image" and given[-1].role == "target"
             is_loss = is_loss and (len(given) == 1 or swapped(*given) is False)
-            found.append(Use(caller, call, other, is_loss or other is not None))
+            is_masked = target is not term.target  # is for the loss unless it is known to be for something else
+            found.append(Use(caller, call, other, is_loss or is_masked or other is not None))
     return sorted(found, key=lambda use: (use.caller.module.path, use.caller.place(use.call).line))
 
 

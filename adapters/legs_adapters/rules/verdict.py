@@ -75,7 +75,8 @@ class Verdicts:
             return why
         uses = uses_of(self.analysis, term)
         others = [use for use in uses if use.other is not None]
-        if others and len(others) == len(uses):
+        is_loss = len(others) < len(uses)  # a call, by reading
+        if others and not is_loss and not by_hand:
             return Left.at(function, place, others[0].other or "")
         unknown = [use for use in uses if not use.is_known]
         if unknown and len(unknown) < len(uses):  # one body serves both
@@ -93,7 +94,7 @@ class Verdicts:
             form = Reread(loss[0], form.call, form.first, form.second)
         is_swapped = term.target is term.pair.first
         site = Site.at(function, form, self._why_photograph(term), is_swapped, term.pair.selection)
-        return site._replace(unweighted=tuple(others))
+        return site._replace(unweighted=tuple(others) if is_loss else ())
 
     def decide_callback(self, holder: Function, form: PassedByName) -> Site | Left:
         """Return the verdict on an L1 function that is passed by name, from the arguments of its call."""

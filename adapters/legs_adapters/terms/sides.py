@@ -58,13 +58,13 @@ def pair_of(meanings: Meanings, ways: Ways, function: Function, form: Form) -> P
         is_by_mask = any(is_mask(meanings, function, index) for index in indices(first))
         selection = on_one_line(code(first)[len(code(first.value, True)) :]) if is_by_mask else ""
         first, second = (first.value, second.value) if is_by_mask else (first, second)  # the weight map needs all of it
-    sides = _without_shared_factors(first, second)
+    sides = without_shared_factors(first, second)
     answers = surest(meanings, ways, function, sides)
     a, b = (answers.meaning(function, side) for side in sides)
     return Pair(first, second, selection, a, b, answers is ways)
 
 
-def _without_shared_factors(first: ast.expr, second: ast.expr) -> List[ast.expr]:
+def without_shared_factors(first: ast.expr, second: ast.expr) -> List[ast.expr]:
     """Return ``image`` and ``gt`` of ``image * (1 - mask)`` and ``gt * (1 - mask)``."""
     if not (isinstance(first, ast.BinOp) and isinstance(second, ast.BinOp)):
         return [first, second]
@@ -73,7 +73,7 @@ def _without_shared_factors(first: ast.expr, second: ast.expr) -> List[ast.expr]
     for one, factor in ((first.left, first.right), (first.right, first.left)):
         for other, again in ((second.left, second.right), (second.right, second.left)):
             if same(factor, again):
-                return _without_shared_factors(one, other)
+                return without_shared_factors(one, other)
     return [first, second]
 
 

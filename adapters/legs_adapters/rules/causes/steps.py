@@ -18,7 +18,7 @@ class _ByPurpose(Rule):
 
 
 class PoseStep(_ByPurpose):
-    """By the names of what it is given, the optimiser updates camera poses, or an embedding; no Gaussians were found.
+    """By the names of what it is given, the optimiser updates poses, exposures or embeddings; no Gaussians were found.
 
     skipped:
         def refine(gaussians, camera):

@@ -5,6 +5,8 @@ VENV ?= .venv
 TORCH ?= torch==2.13.0
 BIN = $(VENV)/bin
 SIDE_BY_SIDE = -n auto --maxprocesses 4 --dist worksteal
+# The demo needs a part of torch: Python compiles what it imports, once, where pip would compile all of it for a minute.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-slow lint docs dist clean
 
@@ -34,7 +36,7 @@ dist: $(VENV)/.lint
 
 $(VENV)/.demo: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)" -e ".[report,patch,completion]"
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check "$(TORCH)" -e ".[report,patch,completion]"
 	touch $@
 
 $(VENV)/.test: pyproject.toml

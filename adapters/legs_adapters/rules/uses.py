@@ -41,7 +41,7 @@ def uses_of(analysis: Analysis, term: Term) -> List[Use]:
             other = _why_other(analysis, caller, call, given, is_rendered(analysis, caller, image))
             is_loss = given[0].kind == "image" and given[-1].role == "target"
             is_loss = is_loss and (len(given) == 1 or swapped(*given) is False)
-            is_masked = target is not term.target  # is for the loss unless it is known to be for something else
+            is_masked = target is not term.target  # for the loss, unless known to be for something else
             found.append(Use(caller, call, other, is_loss or is_masked or other is not None))
     return sorted(found, key=lambda use: (use.caller.module.path, use.caller.place(use.call).line))
 

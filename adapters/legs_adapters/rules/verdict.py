@@ -75,7 +75,7 @@ class Verdicts:
             return why
         uses = uses_of(self.analysis, term)
         others = [use for use in uses if use.other is not None]
-        is_loss = len(others) < len(uses)  # a call, by reading
+        is_loss = len(others) < len(uses)  # some call is, by reading
         if others and not is_loss and not by_hand:
             return Left.at(function, place, others[0].other or "")
         unknown = [use for use in uses if not use.is_known]

@@ -12,7 +12,7 @@ from legs_loss import LegsError
 
 SIDE = 16  # cells of a thumbnail
 _FINE = 4  # parts of a cell, each way
-_MOST = SIDE * _FINE
+_PARTS = SIDE * _FINE  # of a picture, each way
 SURE = 0.94  # the correlation from which on a picture is a file's
 DETAIL = 0.6  # that of what the parts of cells have beside it: less is a rendering, or another view
 MAX_FILES = 4000
@@ -28,7 +28,7 @@ _EQUAL, _REST = 0.2, 0.005  # equal pixels of a part of a photograph; the varian
 
 
 class Picture(NamedTuple):
-    """The means of the parts of a picture's cells [3, 256, 16], which of them are no background, and its size."""
+    """The means of the parts of a picture's cells [3, 256, 16], which of them are no background, its size up to 64."""
 
     parts: Any
     kept: Any
@@ -85,21 +85,21 @@ class Photographs:
         if picture is None:
             return None
         best = self._best(0, picture)
-        if best is None or best.correlation < SURE:
-            found = [match for match in (best, self._best(1, picture)) if match is not None]
-            best = max(found, key=lambda match: match.correlation, default=None)
-        if best is None or best.correlation < SURE:
-            return best
-        parts, kept, size = picture
-        file = _thumbnails((os.path.join(self.root, best.path),), size)[1]
+        if best is None or best[0].correlation < SURE:
+            found = [each for each in (best, self._best(1, picture)) if each is not None]
+            best = max(found, key=lambda each: each[0].correlation, default=None)
+        if best is None or best[0].correlation < SURE:
+            return best and best[0]
+        (match, file), (parts, kept, size) = best, picture
         is_small = min(size) < 2 * SIDE  # without detail
         detail = 1.0 if is_small else float(_likeness(_high(parts, kept), _high(file, kept))[0])
         if detail < DETAIL:
-            return best._replace(correlation=min(best.correlation, SURE * max(detail, 0.0)))
+            return match._replace(correlation=min(match.correlation, SURE * max(detail, 0.0)))
         is_grey = _colours(_cells(parts, kept)) + 1e-4 < _GREY * _colours(_cells(file, kept)[0])
-        return best._replace(detail=detail, is_photograph=best.is_photograph and not is_grey)
+        return match._replace(detail=detail, is_photograph=match.is_photograph and not is_grey)
 
-    def _best(self, tier: int, picture: Picture) -> Optional[Match]:
+    def _best(self, tier: int, picture: Picture) -> Optional[Tuple[Match, Any]]:
+        """Return the file that a picture's cells are most like, and its parts [1, 3, 256, 16]."""
         import numpy as np
 
         parts, kept, size = picture
@@ -108,7 +108,7 @@ class Photographs:
             return None
         scores = _likeness(_cells(parts, kept), _cells(stack, kept))
         at = int(np.argmax(scores))
-        return Match(os.path.relpath(files[at], self.root), float(scores[at]), not tier)
+        return Match(os.path.relpath(files[at], self.root), float(scores[at]), not tier), stack[at : at + 1]
 
 
 def _colours(thumb: Any) -> float:
@@ -151,13 +151,13 @@ def thumbnail(picture: Any) -> Optional[Picture]:
         equal = [((image - each).abs() < 1e-6).all(0) for each in (image.new_zeros(1), image.new_ones(1), ground)]
         near = max_pool2d(torch.stack(equal).any(0)[None].float(), 3, 1, 1)  # and what is blurred at its border
         parts, kept = _pooled(image), _pooled(near)[0] < 1e-6
-    size = min(image.shape[1], _MOST), min(image.shape[2], _MOST)
+    size = min(image.shape[1], _PARTS), min(image.shape[2], _PARTS)
     return Picture(parts, kept if _inside(kept).sum() >= 16 else np.ones_like(kept), size)
 
 
 def _pooled(image: Any) -> Any:
     """Return the means over the parts of the cells of an image [C, H, W], as an array [C, 256, 16]."""
-    parts = _resampled(image, (_MOST, _MOST)).reshape(len(image), SIDE, _FINE, SIDE, _FINE)
+    parts = _resampled(image, (_PARTS, _PARTS)).reshape(len(image), SIDE, _FINE, SIDE, _FINE)
     return parts.transpose(2, 3).reshape(len(image), SIDE**2, _FINE**2).cpu().numpy()
 
 
@@ -280,7 +280,7 @@ def _thumbnails(files: Tuple[str, ...], size: Tuple[int, int]) -> Tuple[Sequence
     for path in files:
         try:
             with Image.open(path) as image:
-                image.draft("RGB", (4 * _MOST, 4 * _MOST))  # of a JPEG: decoded smaller
+                image.draft("RGB", (4 * _PARTS, 4 * _PARTS))  # of a JPEG: decoded smaller
                 pixels = torch.as_tensor(np.array(image.convert("RGB"), np.float32)).permute(2, 0, 1) / 255
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             continue

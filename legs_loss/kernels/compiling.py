@@ -13,7 +13,8 @@ import threading
 import time
 from contextlib import contextmanager, suppress
 from queue import SimpleQueue
-from typing import Any, Callable, Iterator, List, Optional, Sequence
+from types import SimpleNamespace
+from typing import Any, Callable, Iterable, Iterator, List, Optional, Sequence
 
 import numba
 import numpy as np
@@ -21,6 +22,8 @@ import torch
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils, event, extending
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.typing import arraydecl
 from numba.core.typing.templates import infer_global
 from tqdm import tqdm
@@ -32,14 +35,18 @@ from legs_loss.system.terminal import is_first_process, say
 # says otherwise: if the compiler may choose, the process that compiles and a later one that loads the cached code can
 # differ in the last bit.
 FAST = {"nnan", "ninf", "nsz"}
+_OPTIONS = {"fastmath": FAST, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, "_nrt": False}
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a function on its first call, and keep the machine code on disk where a cache can be written."""
-    options = {"fastmath": FAST, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, **options}
+    """Compile a function on its first call, and keep the machine code on disk where a cache can be written.
+
+    References to arrays are not counted in it, since that locks memory twice a slice; a function that makes an array
+    has to be given `_nrt=True`, as numba calls it, and compiles longer: better it is given what `in_threads` makes.
+    """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = numba.njit(**options)(function)
+        dispatcher = numba.njit(**{**_OPTIONS, **options})(function)
         keep(function, dispatcher)
         return dispatcher
 
@@ -49,11 +56,27 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function that only compiled functions call: Python must not, since it gets no entry for Python.
 
-    The machine code of all that a function calls is made once more with it, so few of them lie one within the other.
-    References to arrays are not counted in it, since that locks memory twice a slice; a part that makes an array has
-    to be given `_nrt=True`, as numba calls it.
+    It is optimised, becomes machine code and is kept on disk with those that call it, and not by itself.
     """
-    return compiled(**{"no_cpython_wrapper": True, "_nrt": False, **options})
+    return numba.njit(**{**_OPTIONS, "no_cpython_wrapper": True, "pipeline_class": _PartCompiler, **options})
+
+
+class _Part(JITCodeLibrary):
+    """The code of a part, as it was lowered."""
+
+    codegen: Any = SimpleNamespace(set_env=lambda name, env: None)  # only machine code has an address to write it to
+
+    def _optimize_final_module(self) -> None:
+        """Leave that to those that call it."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
+class _PartCompiler(Compiler):
+    def compile_extra(self, function: Callable[..., Any]) -> Any:
+        self.state.library = _Part(self.state.targetctx.codegen(), function.__qualname__)
+        return super().compile_extra(function)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
@@ -161,6 +184,7 @@ def _claimed(typingctx: Any, counter: Any) -> Any:
 
 claimed: Any = extending.intrinsic(_claimed)
 
+_Own = Callable[[], Iterable[Any]]  # makes the arguments that no other thread is given
 _MOST: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # a user's, or the processor's cores
 _tasks: SimpleQueue[Any] = SimpleQueue()
 _helpers: List[threading.Thread] = []  # the threads beside the one that calls, begun when they are first needed
@@ -171,11 +195,11 @@ def _help(tasks: SimpleQueue[Any]) -> None:
         _take(*tasks.get())  # a call, which keeps nothing of the task
 
 
-def _take(function: Callable[..., Any], given: Sequence[Any], begun: List[None], ended: SimpleQueue[Any]) -> None:
+def _take(function: Callable[..., Any], own: _Own, given: Any, begun: List[None], ended: SimpleQueue[Any]) -> None:
     begun.append(None)
     error = None
     try:
-        function(*given)
+        function(*own(), *given)
     except BaseException as raised:
         error = raised
     ended.put(error)
@@ -199,12 +223,13 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_begin_anew)  # a forked process has no threads
 
 
-def in_threads(function: Callable[..., Any], tasks: int, *given: Any) -> None:
+def in_threads(function: Callable[..., Any], tasks: int, *given: Any, own: _Own = tuple) -> None:
     """Call a compiled function on as many threads as torch would use.
 
-    It is given a counter, the number of tasks, and the rest. Each thread claims a task after the other from the
-    counter, so one that comes late, or never, leaves its share to the others. (numba's own parallel loops compile each
-    function that they call two times more, and one of their three kinds ends the process when two threads use it.)
+    It is given what `own` makes for each thread, a counter, the number of tasks, and the rest. Each thread claims a
+    task after the other from the counter, so one that comes late, or never, leaves its share to the others. (numba's
+    own parallel loops compile each function that they call two times more, and one of their three kinds ends the
+    process when two threads use it.)
     """
     given = (np.zeros(1, np.int64), tasks, *given)
     count = min(torch.get_num_threads(), tasks, _MOST) - 1
@@ -214,8 +239,8 @@ def in_threads(function: Callable[..., Any], tasks: int, *given: Any) -> None:
     begun: List[None] = []
     ended: SimpleQueue[Any] = SimpleQueue()
     for _ in range(min(count, len(_helpers))):
-        _tasks.put((function, given, begun, ended))
-    function(*given)
+        _tasks.put((function, own, given, begun, ended))
+    function(*own(), *given)
     for _ in begun:  # who has not begun finds no task left
         error = ended.get()
         if error is not None:

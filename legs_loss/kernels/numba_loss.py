@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import nullcontext
+from functools import partial
 from typing import Any, ContextManager, FrozenSet, Optional, Tuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from legs_loss.kernels.codes import CURVES
 from legs_loss.kernels.compiling import claimed, compiled, in_threads, multiply_add, part, said
 from legs_loss.kernels.contract import Backend, PreparedLoss, Terms
 from legs_loss.kernels.numba_response import NO_FLOATS, Images, extremes, operator_of
-from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles
+from legs_loss.kernels.numba_tiles import TILE_HEIGHT, TILE_WIDTH, all_tiles, tile_memory
 from legs_loss.kernels.numba_weights import FORMULAS, WeightSource, weights_of_row
 from legs_loss.spec import WeightSpec
 
@@ -54,6 +55,8 @@ class _NumbaLoss(PreparedLoss):
         self.source = WeightSource(curve, beta, _NO_RANGE, operator_of(made), NO_FLOATS, NO_FLOATS)
         self.steps = np.float32(terms.l1 / self.size), np.float32(2.0 * terms.ssim / self.size)  # of halves of slopes
         down, across = -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)
+        self.rows = partial(np.empty, (3, width), np.float32)
+        self.tile = partial(tile_memory, -(-height // down))
         self.tiles, self.strips = (self.sizes[0] * down * across, down, across), self.sizes[0] * -(-height // _ROWS)
 
     def compute(
@@ -71,12 +74,12 @@ class _NumbaLoss(PreparedLoss):
             source = source._replace(map=_flat(map_))
         if self.terms.ssim == 0.0:
             sums = np.empty(self.strips)
-            in_threads(all_strips, self.strips, images, source, self.steps[0], gradient, sums)
+            in_threads(all_strips, self.strips, images, source, self.steps[0], gradient, sums, own=self.rows)
             error, similarity = np.add.reduce(sums), 0.0
         else:
             tasks, down, across = self.tiles
             sums = np.zeros((tasks, 2))
-            in_threads(all_tiles, tasks, images, down, across, self.steps, source, gradient, sums)
+            in_threads(all_tiles, tasks, images, down, across, self.steps, source, gradient, sums, own=self.tile)
             error, similarity = np.add.reduce(sums)
         loss = float((self.terms.l1 * error + self.terms.ssim * similarity) / self.size + self.terms.constant)
         made = torch.from_numpy(gradient).reshape(self.shape) if self.wanted else None
@@ -101,10 +104,11 @@ def _flat(tensor: Tensor) -> np.ndarray:
 
 
 @compiled(fastmath=False)
-def all_strips(counter, tasks, images, source, scale, gradient, sums):  # type: ignore[no-untyped-def]
+def all_strips(weights, errors, unused, counter, tasks, images, source, scale, gradient, sums):  # type: ignore[no-untyped-def]
     """Compute the weighted L1 strip by strip, and its gradient if that has a size.
 
     Args:
+        weights, errors, unused: a row's memory each.
         counter, tasks: of `in_threads`; a task is a strip.
         images: an Images.
         source: a WeightSource.
@@ -113,7 +117,6 @@ def all_strips(counter, tasks, images, source, scale, gradient, sums):  # type: 
         sums: float64 [B * strips]: the weighted absolute error of each strip is written.
     """
     strips, width = tasks // images.views, images.width
-    weights, errors, unused = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     task = claimed(counter)
     while task < tasks:
         view, strip = task // strips, task % strips

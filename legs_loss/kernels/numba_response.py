@@ -5,6 +5,7 @@ The loops are plain and short, a channel at a time, so that LLVM makes vectors o
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -62,7 +63,8 @@ def extremes(image: np.ndarray, operator: OperatorCode, responses: np.ndarray = 
     strips = -(-height // _ROWS)
     found = np.empty((views * strips, 3), np.float32)
     images = Images(image.reshape(-1), image.reshape(-1), views, channels, height, width)
-    in_threads(_strips, views * strips, images, operator, strips, responses, found)
+    own = partial(np.empty, (4, width), np.float32)
+    in_threads(_strips, views * strips, images, operator, strips, responses, found, own=own)
     out, found = np.empty((views, 3), np.float32), found.reshape(views, strips, 3)
     for number, join in enumerate((np.minimum, np.maximum, np.add)):
         join.reduce(found[:, :, number], 1, out=out[:, number])
@@ -70,10 +72,8 @@ def extremes(image: np.ndarray, operator: OperatorCode, responses: np.ndarray = 
 
 
 @compiled(fastmath=False)
-def _strips(counter, tasks, images, operator, strips, responses, found):  # type: ignore[no-untyped-def]
+def _strips(own, low, high, excess, counter, tasks, images, operator, strips, responses, found):  # type: ignore[no-untyped-def]
     height, width = images.height, images.width
-    own = np.empty(width, np.float32)
-    low, high, excess = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     task = claimed(counter)
     while task < tasks:
         view, strip = task // strips, task % strips
@@ -140,7 +140,7 @@ def _join_inner(above, here, below, count, operator, out):  # type: ignore[no-un
         out[j] = _joined(out[j], above, here, below, j, j + 1, j + 2, operator)
 
 
-@inlined
+@part(fastmath=False, forceinline=True)
 def _joined(sum, above, here, below, west, j, east, operator):  # type: ignore[no-untyped-def]
     # Differences are taken in torch's order, which is exactly zero on a constant image.
     if operator.stencil == GRADIENT:

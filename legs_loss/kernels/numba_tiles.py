@@ -14,9 +14,10 @@ across rows do. Sums are taken by column, which keeps their order whatever the w
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Tuple
 
 import numpy as np
+import torch
 
 from legs_loss.kernels.compiling import claimed, compiled, inlined, multiply_add, part
 from legs_loss.kernels.numba_weights import copy_row, weights_of_row
@@ -75,12 +76,21 @@ class Rows(NamedTuple):
     sums: np.ndarray
 
 
+def tile_memory(height: int) -> Tuple[Rows]:
+    """Return the memory of a thread whose tiles have this height: torch's, which begins where a cache line does."""
+    sizes = 3 * _PITCH, (height, _PITCH), 7 * _FIELD, 4 * _BLURRED + _LINE, 4 * _PITCH + _LINE, 2 * _PITCH, 2 * _PITCH
+    rows = Rows(*(torch.empty(size).numpy() for size in sizes))
+    for row in rows:
+        row.fill(0)  # not by torch, which would do so in threads of its own
+    return (rows,)
+
+
 @compiled(fastmath=False)
-def all_tiles(counter, tasks, images, down, across, scales, source, gradient, sums):  # type: ignore[no-untyped-def]
+def all_tiles(rows, counter, tasks, images, down, across, scales, source, gradient, sums):  # type: ignore[no-untyped-def]
     """Compute the weighted L1 and SSIM tile by tile, and the gradient of the loss if that has a size.
 
     Args:
-        counter, tasks: of `in_threads`; a task is a tile.
+        rows, counter, tasks: of `tile_memory` and `in_threads`; a task is a tile.
         images: an Images.
         down, across: how many tiles there are each way.
         scales: of the gradients of the weighted absolute errors and of SSIM.
@@ -88,15 +98,6 @@ def all_tiles(counter, tasks, images, down, across, scales, source, gradient, su
         gradient: float32 [B * C * H * W], or empty.
         sums: float64 [B * down * across, 2], zeros: the weighted absolute error and SSIM of each tile are added.
     """
-    rows = Rows(
-        np.empty(3 * _PITCH, np.float32),
-        np.zeros((-(-images.height // down), _PITCH), np.float32),
-        np.zeros(7 * _FIELD, np.float32),
-        np.zeros(4 * _BLURRED + _LINE, np.float32),
-        np.zeros(4 * _PITCH + _LINE, np.float32),
-        np.empty(2 * _PITCH, np.float32),
-        np.empty(2 * _PITCH, np.float32),
-    )
     task = claimed(counter)
     while task < tasks:
         _task(task, images, down, across, scales, source, rows, gradient, sums[task])
@@ -158,11 +159,11 @@ def _similarity_of_step(images, tile, base, rows):  # type: ignore[no-untyped-de
     """Add the SSIM of the rows from `base`; write its slopes."""
     inner = tile.right - tile.left
     first, last = max(0, tile.top - _REACH - base), min(_STEP, tile.bottom + _REACH - base)
-    _blur_across(rows.fields, rows.across, 4, first, last, _lines(inner + 2 * _HALO))
+    _blur_across(rows.fields, rows.across, np.int64(4), first, last, _lines(inner + 2 * _HALO))
     for k in range(first, last):
         inside = rows.inside[0 if 0 <= base + k < images.height else _PITCH :]
         counted, out = np.float32(tile.top <= base + k < tile.bottom), rows.fields[4 * _FIELD + (_HALO + k) * _PITCH :]
-        _blur_along(rows.across[k * _PITCH :], rows.along, 4, _lines(inner + _HALO))
+        _blur_along(rows.across[k * _PITCH :], rows.along, np.int64(4), _lines(inner + _HALO))
         _similarity(rows.along, inside, counted, out, rows.sums[_PITCH:])
 
 

@@ -48,6 +48,28 @@ def test_a_second_process_of_a_run_says_nothing(tmp_path):
     assert run(SMALL, tmp_path, RANK="1") == []
 
 
+PART = """
+from legs_loss.kernels.compiling import compiled, part
+
+@part()
+def thrice(x):
+    return 3 * x
+
+@compiled()
+def caller(x):
+    return thrice(x) + 1
+
+assert caller(2) == 7
+print([made.library.get_pointer_to_function(made.fndesc.mangled_name) for made in thrice.overloads.values()])
+"""
+
+
+def test_a_part_has_machine_code_in_those_that_call_it_alone(tmp_path):
+    assert run(PART, tmp_path) == ["[0]"]
+    assert [path.name.split(".")[1] for path in tmp_path.rglob("*.nbc")] == ["caller"]
+    assert run(PART, tmp_path) == ["[]"]
+
+
 TRAINING = """
 from numba.core import event
 from legs_loss.lab.training.trainer import TrainConfig, compile_step, train

@@ -59,7 +59,7 @@ def test_who_has_begun_is_waited_for_and_who_has_not_is_not():
         over.set()
 
     for _ in compiling._helpers:  # all of them
-        compiling._tasks.put((busy, (), [], compiling.SimpleQueue()))
+        compiling._tasks.put((busy, tuple, (), [], compiling.SimpleQueue()))
     compiling.in_threads(lambda counter, tasks: None, 3)
     release.set()
     assert over.wait(30) and seen[0]
@@ -76,3 +76,18 @@ def test_nothing_of_a_task_is_kept():
             break
         time.sleep(0.05)
     assert seen() is None
+
+
+def test_each_thread_is_given_memory_of_its_own():
+    caller, began, seen = threading.get_ident(), threading.Event(), []
+
+    def work(first, second, counter, tasks, given):
+        seen.append((first, second))
+        if threading.get_ident() == caller:
+            assert began.wait(30)
+        began.set()
+
+    compiling.in_threads(work, 2, 7, own=lambda: (np.zeros(2), np.zeros(3)))
+    (first, second), (first_too, second_too) = seen
+    assert first is not first_too and second is not second_too
+    assert [first.size, second.size, first_too.size, second_too.size] == [2, 3, 2, 3]

@@ -123,7 +123,7 @@ def _reach(splats, i, opacity, mult, tiles, spans):
     return down < across, first, end, count
 
 
-@compiled()
+@compiled(_nrt=True)
 def _touches(splats, opacities, mult, tiles):
     """Return which splats [N, 5], rows of centre and own coordinates, enter a tile, even between its pixels."""
     spans = np.empty((max(tiles[0], tiles[1]), 2), np.int64)
@@ -133,7 +133,7 @@ def _touches(splats, opacities, mult, tiles):
     return found
 
 
-@compiled()
+@compiled(_nrt=True)
 def _clip(counter, blocks, splats, opacities, mult, tiles, boxes, slots, firsts, reached, radii):
     """Take from every slot the rows outside the compact box; a Gaussian with slots and no tile gets radius 0.
 

@@ -73,7 +73,7 @@ class Drawing(NamedTuple):
         """Fill image, entries and ends."""
         in_threads(
             strips.render, len(self.bands), self.bands, self.across, self.ranges, self.splats, self.draws, self.entries,
-            self.ends, background, self.image,
+            self.ends, background, self.image, own=strips.memory,
         )  # fmt: skip
         return self
 
@@ -113,7 +113,7 @@ def draw(
     )
     found = room(ProjectedGaussians, count, 9)
     blocks = -(-count // projection.BLOCK)
-    in_threads(projection.project, blocks, parameters, camera, footprint, found)
+    in_threads(projection.project, blocks, parameters, camera, footprint, found, own=projection.memory)
     splats, depths, radii, clamped, boxes, slots = found
     if tensors.colours is not None:
         splats[:, 6:9] = _array(tensors.colours)
@@ -166,22 +166,14 @@ class _Attach(torch.autograd.Function):
         sums = sorting.make_sums(it.firsts, moments)
         in_threads(
             strips.render_backward, len(it.bands), it.bands, it.across, it.ranges, it.draws, it.entries, it.ends,
-            it.image, _array(g_image), moments, sums.reshape(-1),
+            it.image, _array(g_image), moments, sums.reshape(-1), own=strips.memory,
         )  # fmt: skip
         shapes = [(len(it.radii), ctx.columns), *(None if array is None else array.shape for array in it.parameters)]
         gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
         filled: List[Any] = [None if gradient is None else gradient.numpy() for gradient in gradients]
         in_threads(
-            projection_backward.project_backward,
-            -(-len(it.radii) // projection.BLOCK),
-            it.parameters,
-            it.camera,
-            it.splats,
-            it.clamped,
-            it.firsts,
-            sums,
-            Parameters(*filled[1:]),
-            filled[0],
-        )
+            projection_backward.project_backward, -(-len(it.radii) // projection.BLOCK), it.parameters, it.camera,
+            it.splats, it.clamped, it.firsts, sums, Parameters(*filled[1:]), filled[0], own=projection.memory,
+        )  # fmt: skip
         found = [gradient if wanted else None for gradient, wanted in zip(gradients, ctx.needs_input_grad[1:])]
         return (None, *found)

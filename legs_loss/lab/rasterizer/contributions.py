@@ -67,7 +67,7 @@ def _strip(strip, across, begin, end, splats, draws, entries, values, image, g_i
             sums[k, MOST] += 1
 
 
-@compiled()
+@compiled(_nrt=True)
 def _strips(counter, strips, across, ranges, ends, splats, draws, entries, values, image, g_image, sums):
     strip = claimed(counter)
     while strip < strips:

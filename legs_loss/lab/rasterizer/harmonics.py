@@ -14,6 +14,7 @@ import re
 from itertools import combinations_with_replacement
 
 import numpy as np
+import torch
 
 from legs_loss.kernels.compiling import inlined, part
 from legs_loss.lab.conventions import SH_C0, SH_C1, SH_C2, SH_C3
@@ -124,17 +125,22 @@ def _direction_gradient(coefficients, rows):
         store(rows, (TO + k) * LANES, _row(rows, TO + k) - along * _row(rows, MONOMIAL + 1 + k))
 
 
-@part(_nrt=True)
-def shade(drawn, count, means, position, degree, sh, clamped, splats, column):
+def memory():
+    """Return what a thread needs for eight Gaussians: the rows, distances, and where their coefficients begin."""
+    return ((torch.empty(ROWS * LANES).numpy(), np.empty(LANES), np.empty((2, LANES), np.int64)),)
+
+
+@part()
+def shade(own, drawn, count, means, position, degree, sh, clamped, splats, column):
     """Fill Gaussians' colours as seen from `position`, and which of their channels are clamped at 0.
 
     Args:
+        own: a thread's memory, of `memory`.
         drawn: which Gaussians, its first `count` numbers.
         means, sh, clamped, splats: of all; [N, 3], [N, K, 3], [N, 3], [N, columns].
         column: of the splats, the first of the colour's three.
     """
-    rows, distances = np.empty(ROWS * LANES, np.float32), np.empty(LANES)
-    starts, coefficients = np.empty((2, LANES), np.int64), (degree + 1) * (degree + 1)
+    (rows, distances, starts), coefficients = own, (degree + 1) * (degree + 1)
     numbers, width = sh.reshape(-1), 3 * sh.shape[1]
     for begin in range(0, count, LANES):
         _begin(drawn, begin, count, means, position, coefficients, numbers, width, rows, distances, starts)
@@ -151,17 +157,16 @@ def shade(drawn, count, means, position, degree, sh, clamped, splats, column):
                 splats[i, column + channel] = max(value, np.float32(0))
 
 
-@part(_nrt=True)
-def shade_gradient(drawn, count, means, position, degree, sh, clamped, colours, g_means, g_sh):
+@part()
+def shade_gradient(own, drawn, count, means, position, degree, sh, clamped, colours, g_means, g_sh):
     """Fill the gradients to Gaussians' coefficients from those to their colours, and add to those of their means.
 
     Args:
-        drawn, count, means, position, degree, sh, clamped: as for `shade`.
+        own, drawn, count, means, position, degree, sh, clamped: as for `shade`.
         colours, g_means: [3, count], a column for each of those drawn.
         g_sh: as sh.
     """
-    rows, distances = np.empty(ROWS * LANES, np.float32), np.empty(LANES)
-    starts, coefficients = np.empty((2, LANES), np.int64), (degree + 1) * (degree + 1)
+    (rows, distances, starts), coefficients = own, (degree + 1) * (degree + 1)
     numbers, gradients, width, used = sh.reshape(-1), g_sh.reshape(-1), 3 * sh.shape[1], 3 * coefficients
     for begin in range(0, count, LANES):
         _ask(drawn, begin, count, width, gradients)

@@ -15,9 +15,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
 
 from legs_loss.kernels.compiling import claimed, compiled, inlined, part
 from legs_loss.lab.conventions import FARTHEST, MIN_ALPHA, NEAR, SQUARE, TILE
+from legs_loss.lab.rasterizer import harmonics
 from legs_loss.lab.rasterizer.geometry import (
     conic,
     linearised,
@@ -38,7 +40,9 @@ FAINTEST = math.log(MIN_ALPHA) - 1e-3  # what is left out is fainter than MIN_AL
 # Rows of a block's state: the mean and the shape (scales and quaternion, or covariance), then what is drawn of them.
 MEAN, SHAPE = 0, 3
 CENTRE, COVARIANCE, DETERMINANT, LARGEST = 0, 2, 5, 6
-STATE = 10, BLOCK + 8  # a row ends 64 bytes past a power of two: else all rows would fall into one set of the cache
+# Behind them the rows of the backward pass. One ends 64 bytes past a power of two, or all would fall into one set of
+# the cache.
+STATE = 24, BLOCK + 8
 
 
 @part()
@@ -142,12 +146,12 @@ def _in_the_image(scales, covariances, count, intrinsics, pose, dilation, state)
 
 
 @inlined
-def _project_block(first, end, parameters, camera, footprint, found):
+def _project_block(own, first, end, parameters, camera, footprint, found):
     means, scales, quaternions, opacities, sh, covariances = parameters
     degree, intrinsics, pose, position, size = camera
     dilation, square = footprint
     splats, depths, radii, clamped, boxes, slots = found
-    state, before_camera, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
+    (state, before_camera, eight), count = own, np.int64(0)
     for i in range(np.uint64(first), np.uint64(end)):
         radii[i] = 0
         slots[i] = 0
@@ -196,16 +200,21 @@ def _project_block(first, end, parameters, camera, footprint, found):
         splats[i, 5] = summit
         drawn[seen] = i  # where what was read stood, or before
         seen += 1
-    shade(drawn, seen, means, position, degree, sh, clamped, splats, np.int64(6))
+    shade(eight, drawn, seen, means, position, degree, sh, clamped, splats, np.int64(6))
+
+
+def memory():
+    """Return what a thread needs for a block of Gaussians: its state, numbers of some, and what `shade` does."""
+    return ((torch.empty(STATE, dtype=torch.float64).numpy(), np.empty(BLOCK, np.int64), *harmonics.memory()),)
 
 
 @compiled()
-def project(counter, blocks, parameters, camera, footprint, found):
+def project(own, counter, blocks, parameters, camera, footprint, found):
     """Fill the `ProjectedGaussians` of `Parameters`, a `GaussianCamera` and a `Footprint` (groups.py): `in_threads`."""
     count, block = len(parameters.means), claimed(counter)
     while block < blocks:
         first = block * BLOCK
-        _project_block(first, min(first + BLOCK, count), parameters, camera, footprint, found)
+        _project_block(own, first, min(first + BLOCK, count), parameters, camera, footprint, found)
         block = claimed(counter)
 
 

@@ -31,7 +31,6 @@ from legs_loss.lab.simd.memory import load
 # second moments by those coordinates, of the colour's gradient, and the two absolute ones. In place of mean and shape,
 # then, their gradients.
 AXES, POWER, FIRST, SECOND, COLOUR, ABSOLUTE = 10, 13, 14, 16, 19, 22
-STATE = 24, BLOCK + 8  # see projection.py
 
 LENGTH = 1 / UNIT  # of a step of 1 in an entry's coordinates, in the splat's own
 
@@ -156,12 +155,12 @@ def _backward(scales, covariances, count, intrinsics, pose, state):
 
 
 @inlined
-def _project_backward_block(first, end, parameters, camera, splats, clamped, firsts, sums, gradients, g_view):
+def _project_backward_block(own, first, end, parameters, camera, splats, clamped, firsts, sums, gradients, g_view):
     means, scales, quaternions, opacities, sh, covariances = parameters
     degree, intrinsics, pose, position, size = camera
     g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances = gradients
     half = size[0] / 2, size[1] / 2
-    state, drawn, count = np.empty(STATE), np.empty(BLOCK, np.int64), np.int64(0)
+    (state, drawn, eight), count = own, np.int64(0)
     for i in range(np.uint64(first), np.uint64(end)):
         if firsts[i, FIRST_SUM] == firsts[i + np.uint64(1), FIRST_SUM]:
             _no_gradient(i, g_means, g_scales, g_quaternions, g_opacities, g_sh, g_covariances)
@@ -176,7 +175,7 @@ def _project_backward_block(first, end, parameters, camera, splats, clamped, fir
     _backward(scales, covariances, count, intrinsics, pose, state)
     # The colour: to the coefficients, and through the direction to the mean.
     colours, towards = state[COLOUR : COLOUR + 3], state[MEAN : MEAN + 3]
-    shade_gradient(drawn, count, means, position, degree, sh, clamped, colours, towards, g_sh)
+    shade_gradient(eight, drawn, count, means, position, degree, sh, clamped, colours, towards, g_sh)
     for j in range(np.uint64(count)):
         i = np.uint64(drawn[j])
         _take_out(g_scales, g_quaternions, g_covariances, i, state, j)
@@ -191,11 +190,11 @@ def _project_backward_block(first, end, parameters, camera, splats, clamped, fir
 
 
 @compiled()
-def project_backward(counter, blocks, parameters, camera, splats, clamped, firsts, sums, gradients, g_view):
+def project_backward(own, counter, blocks, parameters, camera, splats, clamped, firsts, sums, gradients, g_view):
     """Fill the gradients of each Gaussian from the sums of its entries'; of what is None, there is none.
 
     Args:
-        counter, blocks: of `in_threads`; a block is BLOCK Gaussians.
+        own, counter, blocks: of `in_threads`, and of `memory`; a block is BLOCK Gaussians.
         parameters, gradients: `Parameters`, with None in the same places.
         camera: `GaussianCamera`.
         splats: [N, 9], as projected.
@@ -208,5 +207,5 @@ def project_backward(counter, blocks, parameters, camera, splats, clamped, first
     while block < blocks:
         first = block * BLOCK
         end = min(first + BLOCK, count)
-        _project_backward_block(first, end, parameters, camera, splats, clamped, firsts, sums, gradients, g_view)
+        _project_backward_block(own, first, end, parameters, camera, splats, clamped, firsts, sums, gradients, g_view)
         block = claimed(counter)

@@ -106,7 +106,7 @@ def unpacked(rows):
     return rows & 255, rows >> 8 & 255, rows >> 16
 
 
-@compiled()
+@compiled(_nrt=True)
 def _by_strip(depths, firsts, reached, ranges, keys, draws):
     """Fill each strip's entries in the order of their splats, and `keys` with the bits of their depths."""
     for slot in range(len(reached)):
@@ -156,7 +156,7 @@ def _sort_strip(keys, draws):
             draws[k, column] = entries[order[k], column]
 
 
-@compiled()
+@compiled(_nrt=True)
 def _by_depth(counter, strips, ranges, keys, draws):
     strip = claimed(counter)
     while strip < strips:

@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
 
 from legs_loss.kernels.compiling import claimed, compiled, inlined, part
 from legs_loss.kernels.compiling import multiply_add as multiply_add_one
@@ -206,10 +207,15 @@ def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, ba
                 image[channel, top + y, left + x] = multiply_add_one(abs(state[T + i]), background[channel], colour)
 
 
+def memory():
+    """Return the state of a strip."""
+    return (torch.empty(STATE).numpy(),)
+
+
 @compiled()
-def render(counter, tasks, bands, across, ranges, splats, draws, entries, ends, background, image):
+def render(state, counter, tasks, bands, across, ranges, splats, draws, entries, ends, background, image):
     """Fill the image, and for each strip its entries, up to the end of those that mattered: `in_threads`."""
-    state, band = np.empty(STATE, np.float32), claimed(counter)
+    band = claimed(counter)
     while band < tasks:
         for strip in range(bands[band, 0], bands[band, 1]):
             _render_strip(strip, across, state, ranges, splats, draws, entries, ends, background, image)
@@ -274,9 +280,9 @@ def _render_backward_strip(strip, across, state, ranges, draws, entries, ends, i
 
 
 @compiled()
-def render_backward(counter, tasks, bands, across, ranges, draws, entries, ends, image, g_image, moments, sums):
+def render_backward(state, counter, tasks, bands, across, ranges, draws, entries, ends, image, g_image, moments, sums):
     """Add the gradient of every entry to its Gaussian's sums; the absolute ones too, where there is room for them."""
-    state, band = np.empty(STATE, np.float32), claimed(counter)
+    band = claimed(counter)
     while band < tasks:
         for strip in range(bands[band, 0], bands[band, 1]):
             _render_backward_strip(strip, across, state, ranges, draws, entries, ends, image, g_image, moments, sums)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from legs_loss.kernels.compiling import in_threads
-from legs_loss.lab.rasterizer import sorting
+from legs_loss.lab.rasterizer import harmonics, sorting
 from legs_loss.lab.rasterizer.groups import room
 from legs_loss.lab.surfels import projection, projection_backward, strips
 from legs_loss.lab.surfels.groups import DiscCamera, Discs, Pictures, ProjectedDiscs, Work
@@ -42,7 +42,7 @@ class _Render(torch.autograd.Function):
             height=height,
         )
         found = room(ProjectedDiscs, count, projection.SPLAT, projection.EXTENT)
-        in_threads(projection.project, -(-count // projection.BLOCK), discs, camera, found)
+        in_threads(projection.project, -(-count // projection.BLOCK), discs, camera, found, own=harmonics.memory)
 
         across, down = -(-width // projection.WIDE), -(-height // projection.TALL)
         firsts, reached = sorting.make_slots(found.boxes, found.slots, projection.TALL)
@@ -83,9 +83,8 @@ class _Render(torch.autograd.Function):
         viewspace = torch.zeros(len(discs.means), 3)
         gradients = Discs(*(result.numpy() for result in results))
         blocks = -(-len(discs.means) // projection.BLOCK)
-        in_threads(
-            projection_backward.project_backward, blocks, discs, camera, *drawn, sums, gradients, viewspace.numpy()
-        )
+        filled = *drawn, sums, gradients, viewspace.numpy()
+        in_threads(projection_backward.project_backward, blocks, discs, camera, *filled, own=harmonics.memory)
         wanted = ctx.needs_input_grad
         found = [result if wanted[2 + k] else None for k, result in enumerate(results)]
         return (viewspace if wanted[0] else None, None, *found)

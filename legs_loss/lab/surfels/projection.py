@@ -29,7 +29,7 @@ ELLIPSE, CIRCLE, REACH, EXTENT = 0, 5, 7, 8
 
 
 @inlined
-def _project_block(begin, end, discs, camera, found):
+def _project_block(eight, begin, end, discs, camera, found):
     means, scales, quaternions, homographies, opacities, sh, colours = discs
     degree, pose, pixels, position, width, height = camera
     splats, extents, depths, radii, clamped, boxes, slots = found
@@ -92,16 +92,16 @@ def _project_block(begin, end, discs, camera, found):
         splats[i, CENTRE], splats[i, CENTRE + 1], splats[i, OPACITY] = u, v, math.log2(opacity)
         depths[i] = np.float32(depth)
     if len(colours) == 0:
-        shade(drawn, count, means, position, degree, sh, clamped, splats, COLOUR)
+        shade(eight, drawn, count, means, position, degree, sh, clamped, splats, COLOUR)
 
 
-@compiled(fastmath=CAREFUL)
-def project(counter, blocks, discs, camera, found):
+@compiled(fastmath=CAREFUL, _nrt=True)
+def project(eight, counter, blocks, discs, camera, found):
     """Fill the `ProjectedDiscs` that `Discs` become to a `DiscCamera` (groups.py): `in_threads`."""
     count, block = len(discs.means), claimed(counter)
     while block < blocks:
         begin = block * BLOCK
-        _project_block(begin, min(begin + BLOCK, count), discs, camera, found)
+        _project_block(eight, begin, min(begin + BLOCK, count), discs, camera, found)
         block = claimed(counter)
 
 

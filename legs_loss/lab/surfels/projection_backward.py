@@ -66,7 +66,7 @@ def _to_world(gx, gy, gw, pixels, k):
 
 
 @inlined
-def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, sums_of_bands, gradients, g_view):
+def _project_backward_block(eight, begin, end, discs, camera, splats, clamped, firsts, bands, gradients, g_view):
     means, scales, quaternions, homographies, opacities, sh, colours = discs
     degree, pose, pixels, position, width, height = camera
     g_means, g_scales, g_quaternions, g_homographies, g_opacities, g_sh, g_colours = gradients
@@ -79,7 +79,7 @@ def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, 
         sums[:] = 0
         for row in range(firsts[i, FIRST_SUM], firsts[i + 1, FIRST_SUM]):
             for k in range(GRADIENTS):
-                sums[k] += sums_of_bands[row, k]
+                sums[k] += bands[row, k]
         g_opacities[i, 0] = sums[G_OPACITY] / opacities[i, 0]
         x, y, w, _, turn = shape(means, scales, quaternions, homographies, i, pose, pixels)
         gx, gy, gw = _rows_gradient(x, y, w, splats[i, CENTRE], splats[i, CENTRE + 1], sums)
@@ -123,18 +123,18 @@ def _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, 
             )  # fmt: skip
             g_quaternions[i, 0], g_quaternions[i, 1], g_quaternions[i, 2], g_quaternions[i, 3] = w0, w1, w2, w3
         g_means[i, 0], g_means[i, 1], g_means[i, 2] = mx, my, mz
-    shade_gradient(drawn, count, means, position, degree, sh, clamped, colour, towards, g_sh)
+    shade_gradient(eight, drawn, count, means, position, degree, sh, clamped, colour, towards, g_sh)
     for j in range(count):
         for k in range(3):
             g_means[drawn[j], k] += towards[k, j]
 
 
-@compiled()
-def project_backward(counter, blocks, discs, camera, splats, clamped, firsts, sums, gradients, g_view):
+@compiled(_nrt=True)
+def project_backward(eight, counter, blocks, discs, camera, splats, clamped, firsts, sums, gradients, g_view):
     """Fill the gradients, zeros, of each disc that is drawn from its sums in the bands.
 
     Args:
-        counter, blocks: of `in_threads`; a block is BLOCK discs.
+        eight, counter, blocks: of `in_threads` and `harmonics.memory`; a block is BLOCK discs.
         discs, gradients: `Discs`.
         camera: `DiscCamera`.
         splats: [N, SPLAT], as projected.
@@ -147,5 +147,5 @@ def project_backward(counter, blocks, discs, camera, splats, clamped, firsts, su
     while block < blocks:
         begin = block * BLOCK
         end = min(begin + BLOCK, count)
-        _project_backward_block(begin, end, discs, camera, splats, clamped, firsts, sums, gradients, g_view)
+        _project_backward_block(eight, begin, end, discs, camera, splats, clamped, firsts, sums, gradients, g_view)
         block = claimed(counter)

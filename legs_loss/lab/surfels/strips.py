@@ -169,7 +169,7 @@ def _render_strip(strip, state, work, splats, background, pictures):
             kept[0, v, u], kept[1, v, u], kept[2, v, u] = state[M1 + i], state[M2 + i], state[WHICH + i]
 
 
-@compiled(fastmath=CAREFUL)
+@compiled(fastmath=CAREFUL, _nrt=True)
 def render(counter, bands, work, splats, background, pictures):
     """Fill the `Pictures` of splats [N, SPLAT], and of the `Work` the entries and the ends: `in_threads`."""
     state, band = np.empty(STATE, np.float32), claimed(counter)
@@ -292,7 +292,7 @@ def _render_backward_strip(strip, state, work, background, pictures, g_image, g_
     _blend_backward(state, ranges[strip], ends[strip], draws, entries, g_others, sums)
 
 
-@compiled(fastmath=CAREFUL)
+@compiled(fastmath=CAREFUL, _nrt=True)
 def render_backward(counter, bands, work, background, pictures, g_image, g_others, sums):
     """Add the gradient of every entry to its disc's sums, one array; `g_others` may be None."""
     state, band = np.empty(BACKWARD_STATE, np.float32), claimed(counter)

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="for all results, which replace those of an earlier demo there; default: legs_demo",
     )
-    parser.add_argument("--iterations", type=int, default=1200, metavar="N", help="of each training; default: 1200")
+    parser.add_argument("--iterations", type=int, default=1000, metavar="N", help="of each training; default: 1000")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: 0")
 
 

@@ -79,7 +79,7 @@ class Rows(NamedTuple):
 def tile_memory(height: int) -> Tuple[Rows]:
     """Return the memory of a thread whose tiles have this height: torch's, which begins where a cache line does."""
     sizes = 3 * _PITCH, (height, _PITCH), 7 * _FIELD, 4 * _BLURRED + _LINE, 4 * _PITCH + _LINE, 2 * _PITCH, 2 * _PITCH
-    rows = Rows(*(torch.empty(size).numpy() for size in sizes))
+    rows = Rows(*[torch.empty(size).numpy() for size in sizes])
     for row in rows:
         row.fill(0)  # not by torch, which would do so in threads of its own
     return (rows,)

@@ -40,8 +40,8 @@ FAINTEST = math.log(MIN_ALPHA) - 1e-3  # what is left out is fainter than MIN_AL
 # Rows of a block's state: the mean and the shape (scales and quaternion, or covariance), then what is drawn of them.
 MEAN, SHAPE = 0, 3
 CENTRE, COVARIANCE, DETERMINANT, LARGEST = 0, 2, 5, 6
-# Behind them the rows of the backward pass. One ends 64 bytes past a power of two, or all would fall into one set of
-# the cache.
+# Behind these come the rows of the backward pass. A row ends 64 bytes past a power of two, or all would fall into one
+# set of the cache.
 STATE = 24, BLOCK + 8
 
 

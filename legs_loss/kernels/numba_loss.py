@@ -55,8 +55,7 @@ class _NumbaLoss(PreparedLoss):
         self.source = WeightSource(curve, beta, _NO_RANGE, operator_of(made), NO_FLOATS, NO_FLOATS)
         self.steps = np.float32(terms.l1 / self.size), np.float32(2.0 * terms.ssim / self.size)  # of halves of slopes
         down, across = -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)
-        self.rows = partial(np.empty, (3, width), np.float32)
-        self.tile = partial(tile_memory, -(-height // down))
+        self.rows, self.tile = partial(np.empty, (3, width), np.float32), partial(tile_memory, -(-height // down))
         self.tiles, self.strips = (self.sizes[0] * down * across, down, across), self.sizes[0] * -(-height // _ROWS)
 
     def compute(

@@ -14,12 +14,12 @@ across rows do. Sums are taken by column, which keeps their order whatever the w
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import NamedTuple, Tuple
 
 import numpy as np
-import torch
 
-from legs_loss.kernels.compiling import claimed, compiled, inlined, multiply_add, part
+from legs_loss.kernels.compiling import aligned, claimed, compiled, inlined, multiply_add, part
 from legs_loss.kernels.numba_weights import copy_row, weights_of_row
 from legs_loss.similarity import CONTRAST_CONSTANT, LUMINANCE_CONSTANT, SIGMA, WINDOW_SIZE
 
@@ -77,12 +77,10 @@ class Rows(NamedTuple):
 
 
 def tile_memory(height: int) -> Tuple[Rows]:
-    """Return the memory of a thread whose tiles have this height: torch's, which begins where a cache line does."""
-    sizes = 3 * _PITCH, (height, _PITCH), 7 * _FIELD, 4 * _BLURRED + _LINE, 4 * _PITCH + _LINE, 2 * _PITCH, 2 * _PITCH
-    rows = Rows(*[torch.empty(size).numpy() for size in sizes])
-    for row in rows:
-        row.fill(0)  # not by torch, which would do so in threads of its own
-    return (rows,)
+    """Return the memory of a thread whose tiles have this height."""
+    sizes = 3 * _PITCH, height * _PITCH, 7 * _FIELD, 4 * _BLURRED + _LINE, 4 * _PITCH + _LINE, 2 * _PITCH, 2 * _PITCH
+    ends = [*accumulate(sizes)]
+    return (Rows(*map(aligned(ends[-1]).__getitem__, map(slice, [0, *ends], ends))),)
 
 
 @compiled(fastmath=False)
@@ -115,7 +113,7 @@ def _task(task, images, down, across, scales, source, rows, gradient, sums):  # 
     for column in range(max(0, _REACH - left), min(right + _HALO, width + _REACH) - left):
         rows.inside[_dealt(column)] = _ONE
     for row in range(top, bottom):
-        weights_of_row(images, source, view, row, left, right, rows.weights[row - top])
+        weights_of_row(images, source, view, row, left, right, rows.weights[(row - top) * _PITCH :])
     for channel in range(channels):
         tile = Tile((view * channels + channel) * height * width, top, bottom, left, right)
         # The gradient's rows from `base` see SSIM's up to base + 5, and these see the image's up to base + 10.
@@ -175,7 +173,8 @@ def _gradient_of_step(images, tile, base, scales, rows, gradient):  # type: igno
     quantities, columns = (3, inner) if gradient.size > 0 else (0, 0)
     _blur_across(rows.fields[4 * _FIELD :], rows.across, quantities, first, last, _lines(inner + _HALO))
     for k in range(first, last):
-        pixels, weight, out = rows.fields[k * _PITCH :], rows.weights[base + k - tile.top], rows.plain[2 * _PITCH :]
+        pixels, out = rows.fields[k * _PITCH :], rows.plain[2 * _PITCH :]
+        weight = rows.weights[(base + k - tile.top) * _PITCH :]
         _blur_along(rows.across[k * _PITCH :], rows.along, quantities, _lines(inner))
         _gradient_row(pixels, weight, rows.along, scales, rows.sums, out, _lines(inner))
         copy_row(out, gradient[tile.plane + (base + k) * images.width + tile.left :], columns)

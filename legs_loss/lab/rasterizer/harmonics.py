@@ -14,9 +14,8 @@ import re
 from itertools import combinations_with_replacement
 
 import numpy as np
-import torch
 
-from legs_loss.kernels.compiling import inlined, part
+from legs_loss.kernels.compiling import aligned, inlined, part
 from legs_loss.lab.conventions import SH_C0, SH_C1, SH_C2, SH_C3
 from legs_loss.lab.simd.arithmetic import multiply_add, splat
 from legs_loss.lab.simd.lanes import transposed
@@ -127,7 +126,7 @@ def _direction_gradient(coefficients, rows):
 
 def memory():
     """Return what a thread needs for eight Gaussians: the rows, distances, and where their coefficients begin."""
-    return ((torch.empty(ROWS * LANES).numpy(), np.empty(LANES), np.empty((2, LANES), np.int64)),)
+    return ((aligned(ROWS * LANES), np.empty(LANES), np.empty((2, LANES), np.int64)),)
 
 
 @part()

@@ -15,9 +15,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 
-from legs_loss.kernels.compiling import claimed, compiled, inlined, part
+from legs_loss.kernels.compiling import aligned, claimed, compiled, inlined, part
 from legs_loss.lab.conventions import FARTHEST, MIN_ALPHA, NEAR, SQUARE, TILE
 from legs_loss.lab.rasterizer import harmonics
 from legs_loss.lab.rasterizer.geometry import (
@@ -205,7 +204,7 @@ def _project_block(own, first, end, parameters, camera, footprint, found):
 
 def memory():
     """Return what a thread needs for a block of Gaussians: its state, numbers of some, and what `shade` does."""
-    return ((torch.empty(STATE, dtype=torch.float64).numpy(), np.empty(BLOCK, np.int64), *harmonics.memory()),)
+    return ((aligned(STATE[0] * STATE[1], np.float64).reshape(STATE), np.empty(BLOCK, np.int64), *harmonics.memory()),)
 
 
 @compiled()

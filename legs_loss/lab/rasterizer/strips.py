@@ -23,9 +23,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 
-from legs_loss.kernels.compiling import claimed, compiled, inlined, part
+from legs_loss.kernels.compiling import aligned, claimed, compiled, inlined, part
 from legs_loss.kernels.compiling import multiply_add as multiply_add_one
 from legs_loss.lab.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from legs_loss.lab.rasterizer.projection import TALL, WIDE, origin
@@ -209,7 +208,7 @@ def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, ba
 
 def memory():
     """Return the state of a strip."""
-    return (torch.empty(STATE).numpy(),)
+    return (aligned(STATE),)
 
 
 @compiled()

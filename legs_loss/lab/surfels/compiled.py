@@ -76,9 +76,8 @@ class _Render(torch.autograd.Function):
         of_others = None if g_others is None else _array(g_others)
         if of_others is not None and not strips.matters(of_others, others):
             of_others = None
-        pictures = Pictures(image, others, kept)
-        backward = of_image, of_others, sums.reshape(-1)
-        in_threads(strips.render_backward, len(work.bands), work, background, pictures, *backward)
+        backward = Pictures(image, others, kept), of_image, of_others, sums.reshape(-1)
+        in_threads(strips.render_backward, len(work.bands), work, background, *backward)
         results = [torch.zeros(array.shape) for array in discs]
         viewspace = torch.zeros(len(discs.means), 3)
         gradients = Discs(*(result.numpy() for result in results))

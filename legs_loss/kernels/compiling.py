@@ -195,13 +195,18 @@ def _help(tasks: SimpleQueue[Any]) -> None:
         _take(*tasks.get())  # a call, which keeps nothing of the task
 
 
-def _take(function: Callable[..., Any], own: _Own, given: Any, begun: List[None], ended: SimpleQueue[Any]) -> None:
-    begun.append(None)
+def _take(calls: List[Any], ended: SimpleQueue[Any]) -> None:
+    try:
+        function, own, given = calls.pop()
+    except IndexError:  # who called has not waited
+        return
     error = None
     try:
         function(*own(), *given)
     except BaseException as raised:
         error = raised
+    # Who lets a tensor go last frees it; a thread that does so while the interpreter shuts down aborts the process.
+    del function, own, given
     ended.put(error)
 
 
@@ -224,7 +229,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def aligned(count: int, dtype: Any = np.float32) -> np.ndarray:
-    """Return zeros that begin where a cache line does. (torch's do, but end a process that exits in another thread.)"""
+    """Return zeros that begin where a cache line does. (torch's do, too, but see `_take`.)"""
     memory = np.zeros(count + 16, dtype)
     return memory[-(memory.__array_interface__["data"][0] // memory.itemsize) % (64 // memory.itemsize) :][:count]
 
@@ -242,12 +247,16 @@ def in_threads(function: Callable[..., Any], tasks: int, *given: Any, own: _Own 
     if count > len(_helpers):
         _begin(count)
     # Queues and lists are used as they are: with futures each step would take twenty calls of Python more.
-    begun: List[None] = []
-    ended: SimpleQueue[Any] = SimpleQueue()
-    for _ in range(min(count, len(_helpers))):
-        _tasks.put((function, own, given, begun, ended))
+    calls = [(function, own, given)] * min(count, len(_helpers))
+    begun, ended = len(calls), SimpleQueue()  # type: ignore[var-annotated]
+    for _ in range(begun):
+        _tasks.put((calls, ended))
     function(*own(), *given)
-    for _ in begun:  # who has not begun finds no task left
+    while calls:  # who has not begun finds no task left
+        with suppress(IndexError):
+            calls.pop()
+            begun -= 1
+    for _ in range(begun):
         error = ended.get()
         if error is not None:
             raise error

@@ -97,20 +97,17 @@ def draw(
     """
     count = len(tensors.means)
     parameters = Parameters(
-        means=_array(tensors.means),
+        means=_array(tensors.means), opacities=_array(tensors.opacities),
         scales=None if tensors.scales is None else _array(tensors.scales),
         quaternions=None if tensors.quaternions is None else _array(tensors.quaternions),
-        opacities=_array(tensors.opacities),
         sh=np.zeros((count, 1, 3), np.float32) if tensors.sh is None else _array(tensors.sh),
         covariances=None if tensors.covariances is None else _array(tensors.covariances),
-    )
+    )  # fmt: skip
     camera = GaussianCamera(
-        degree=0 if tensors.sh is None else degree,
+        degree=0 if tensors.sh is None else degree, pose=view.world_to_camera, position=view.position,
         intrinsics=np.array([view.fx, view.fy, view.cx, view.cy, *view.limits]),
-        pose=view.world_to_camera,
-        position=view.position,
         size=np.array([view.width, view.height], np.int64),
-    )
+    )  # fmt: skip
     found = room(ProjectedGaussians, count, 9)
     blocks = -(-count // projection.BLOCK)
     in_threads(projection.project, blocks, parameters, camera, footprint, found, own=projection.memory)

@@ -34,13 +34,9 @@ class _Render(torch.autograd.Function):
         discs = Discs(*(_array(tensor) for tensor in tensors))
         width, height, count = view.width, view.height, len(discs.means)
         camera = DiscCamera(
-            degree=view.sh_degree,
-            pose=_array(view.world_to_camera.double()),
-            pixels=_array(view.pixels),
-            position=_array(view.position.double()),
-            width=width,
-            height=height,
-        )
+            degree=view.sh_degree, pose=_array(view.world_to_camera.double()), pixels=_array(view.pixels),
+            position=_array(view.position.double()), width=width, height=height,
+        )  # fmt: skip
         found = room(ProjectedDiscs, count, projection.SPLAT, projection.EXTENT)
         in_threads(projection.project, -(-count // projection.BLOCK), discs, camera, found, own=harmonics.memory)
 
@@ -80,9 +76,8 @@ class _Render(torch.autograd.Function):
         in_threads(strips.render_backward, len(work.bands), work, background, *backward)
         results = [torch.zeros(array.shape) for array in discs]
         viewspace = torch.zeros(len(discs.means), 3)
-        gradients = Discs(*(result.numpy() for result in results))
         blocks = -(-len(discs.means) // projection.BLOCK)
-        filled = *drawn, sums, gradients, viewspace.numpy()
+        filled = *drawn, sums, Discs(*(result.numpy() for result in results)), viewspace.numpy()
         in_threads(projection_backward.project_backward, blocks, discs, camera, *filled, own=harmonics.memory)
         wanted = ctx.needs_input_grad
         found = [result if wanted[2 + k] else None for k, result in enumerate(results)]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import re
 from itertools import combinations_with_replacement
+from typing import Tuple
 
 import numpy as np
 
@@ -124,7 +125,7 @@ def _direction_gradient(coefficients, rows):
         store(rows, (TO + k) * LANES, _row(rows, TO + k) - along * _row(rows, MONOMIAL + 1 + k))
 
 
-def memory():
+def memory() -> Tuple[Tuple[np.ndarray, ...]]:
     """Return what a thread needs for eight Gaussians: the rows, distances, and where their coefficients begin."""
     return ((aligned(ROWS * LANES), np.empty(LANES), np.empty((2, LANES), np.int64)),)
 

@@ -13,6 +13,7 @@ The geometry of a block of Gaussians is computed four at a time: their numbers l
 from __future__ import annotations
 
 import math
+from typing import Tuple
 
 import numpy as np
 
@@ -202,7 +203,7 @@ def _project_block(own, first, end, parameters, camera, footprint, found):
     shade(eight, drawn, seen, means, position, degree, sh, clamped, splats, np.int64(6))
 
 
-def memory():
+def memory() -> Tuple[Tuple[np.ndarray, ...]]:
     """Return what a thread needs for a block of Gaussians: its state, numbers of some, and what `shade` does."""
     return ((aligned(STATE[0] * STATE[1], np.float64).reshape(STATE), np.empty(BLOCK, np.int64), *harmonics.memory()),)
 

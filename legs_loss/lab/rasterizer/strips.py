@@ -21,6 +21,7 @@ Indices are unsigned where it counts: of any other, Python's rules for negative 
 from __future__ import annotations
 
 import math
+from typing import Tuple
 
 import numpy as np
 
@@ -206,7 +207,7 @@ def _render_strip(strip, across, state, ranges, splats, draws, entries, ends, ba
                 image[channel, top + y, left + x] = multiply_add_one(abs(state[T + i]), background[channel], colour)
 
 
-def memory():
+def memory() -> Tuple[np.ndarray]:
     """Return the state of a strip."""
     return (aligned(STATE),)
 

@@ -190,11 +190,7 @@ def _why_missing(name: str) -> Optional[str]:
     """Return why a backend cannot be used in this installation."""
     if name == "cuda":
         return None if torch.version.cuda else "this torch is built without CUDA"
-    if importlib.util.find_spec(name) is None:
-        return "it is not installed"
-    if sys.version_info < (3, 8):
-        return "the last numba for Python 3.7 takes minutes to compile the weights"
-    return None
+    return "it is not installed" if importlib.util.find_spec(name) is None else None
 
 
 def _own_hooks() -> ContextManager[Any]:

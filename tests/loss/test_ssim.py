@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import math
-import sys
 
 import pytest
 import torch
@@ -146,7 +145,6 @@ class TestDropIn:
         with pytest.raises(LegsError, match="odd number of pixels, got 8"):
             ssim(prediction, target, 8)
 
-    @pytest.mark.skipif(sys.version_info < (3, 8), reason="numba is not used on Python 3.7")
     @pytest.mark.parametrize("trained", ["first", "second"])
     def test_a_training_step_is_fused_with_the_same_gradient(self, trained):
         pytest.importorskip("numba")

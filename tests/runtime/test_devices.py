@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 import torch
 
@@ -16,8 +14,6 @@ class TestBackends:
     @pytest.fixture(autouse=True)
     def needs_numba(self):
         pytest.importorskip("numba")
-        if sys.version_info < (3, 8):
-            pytest.skip("numba is not used on Python 3.7")
 
     def test_the_mean_is_one_fused_pass(self):
         prediction, target = pair(3, 30, 40)

@@ -125,6 +125,22 @@ class TestWhichTerm:
         assert weighted(report) == [line], done.stderr
         assert [round(term["share"], 3) for term in report["traced"] if term["is_photometric"]] == [1.0]
 
+    def test_a_list_of_pixels_is_quoted_and_never_written(self, tmp_path):
+        picked = ("image = image[:, ys, xs]", "gt_image = gt_image[:, ys, xs]", "loss = F.l1_loss(image, gt_image)")
+        head = "ys, xs = torch.randint(0, 16, (2, 500))\n"
+        report, _, done = traced(tmp_path, body('image = splats.draw(camera)["rgb"]', *picked, head=head))
+        assert (done.returncode, report["sites"]) == (2, [])
+        assert "100% of the loss; gt_image is no photograph (a list of pixels or points: 3x500)" in done.stderr
+        assert "weight the L1 of the whole images, before pixels are picked or flattened" in done.stderr
+
+    def test_a_list_of_pixels_that_reading_does_not_know_is_said(self, tmp_path):
+        lines = "drawn, photo = image.reshape(3, -1), gt_image.reshape(3, -1)", "parts = {}", "parts[0] = drawn - photo"
+        lines = *lines, "loss = sum(part.abs().mean() for part in parts.values())"
+        report, _, done = traced(tmp_path, body('image = splats.draw(camera)["rgb"]', *lines))
+        (left,) = report["left"]
+        assert (done.returncode, left["code"]) == (2, lines[2])
+        assert left["reason"].startswith("100% of the loss; photo is no photograph (a list of pixels or points: 3x")
+
     def test_one_loop_for_colour_and_depth_is_quoted(self, tmp_path):
         lines = body(
             "drawn, loss = splats.draw(camera), 0",

@@ -9,7 +9,7 @@ from legs_adapters.code.module import Function
 from legs_adapters.code.syntax import arguments, call_name, one_line, walk_expressions
 from legs_adapters.rules.analysis import Analysis
 from legs_adapters.rules.rule import Term
-from legs_adapters.rules.verdict import Verdicts
+from legs_adapters.rules.verdict import OF_PIXELS, Verdicts
 from legs_adapters.terms.findings import Evidence, Findings, Left, Line, Problem, Site, Use
 from legs_adapters.terms.form import Form
 from legs_adapters.terms.kinds.callback import PassedByName
@@ -216,7 +216,8 @@ class _Join:
             return
         if not stack:  # that of a photograph is said: it is squared, or compiled; signed where no other is known
             here = self._line(traced.frames[0])
-            is_silent = traced.why_other or traced.kind == "l1" or (traced.kind == "signed" and self.is_known)
+            is_other = traced.why_other or traced.kind == "l1" or (traced.kind == "signed" and self.is_known)
+            is_silent = is_other and (self.is_known or not (traced.is_list and traced.is_l1))
             if not is_silent and here.path in self.analysis.program.sources:
                 self.entries.append(Left(*here, traced.text(self._name(traced, [])), (here,)))
                 self.settled.update([(here.path, here.line, -1)] if traced.kind != "signed" else [])
@@ -224,9 +225,12 @@ class _Join:
         candidate = own[0]
         place, text = candidate.function.place(candidate.form.node), traced.text(self._name(traced, [candidate]))
         is_left = any(entry[:2] == candidate.key[:2] for entry in self.found.left)
+        known = [entry[:2] for entry in (*self.found.sites, *self.found.problems)]
         if traced.is_unknown and not is_left:
             term = Term(self.analysis, candidate.function, candidate.form)
             self.entries.append(self.verdicts.problem(term, place, text))
+        elif traced.is_list and traced.is_l1 and candidate.key[:2] in known:
+            self.entries.append(Problem.at(candidate.function, place, text, OF_PIXELS))
         else:
             why = Evidence("", text + self._differs(candidate, self.found.sites, "weighted"), ())
             self.entries.append(Left.at(candidate.function, place, why))

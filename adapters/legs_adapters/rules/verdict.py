@@ -41,7 +41,7 @@ from legs_adapters.terms.sides import is_of_numbers, is_role, same_root
 from legs_adapters.terms.text import Text
 
 _OF_DIFFERENCE = "as one absolute difference times the photograph's weight map, with each mask and threshold as it is"
-
+OF_PIXELS = "weight the L1 of the whole images, before pixels are picked or flattened"
 
 _MOST = 100  # expressions that a photograph is followed through
 
@@ -147,8 +147,7 @@ class Verdicts:
         if untold:
             return _ByHand(untold)
         if term.has_rows:
-            why = "the sides are lists of pixels: a weight map needs whole images"
-            return _ByHand(why, "weight the L1 of the whole images, before pixels are picked or flattened")
+            return _ByHand("the sides are lists of pixels: a weight map needs whole images", OF_PIXELS)
         if any(is_of_numbers(term.function, side) for side in term.sides):
             return _ByHand("a side is made of numbers", "leave it: it compares with no photograph")
         if isinstance(term.form, Indirect) and term.form.difference is not None:

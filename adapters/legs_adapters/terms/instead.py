@@ -18,8 +18,7 @@ _CHOSEN = "the loss seems to be chosen here, by {}: name the line that calls it 
 _LOSS = r"\b\w*(?:loss|criteri)\w*"
 _SETTINGS = r"(cfg|conf\w*|opt|args|settings)"
 _INSTEAD = (
-    (r"^[ \t]*(import|from) jax\b", "JAX is imported, and legs_loss is written in torch"),
-    (r"^[ \t]*(import|from) mlx\b", "MLX is imported, and legs_loss is written in torch"),
+    (r"^[ \t]*(import|from) (jax|mlx)\b", "JAX or MLX is imported, and legs_loss is written in torch"),
     (
         r"\bsuper\(\)\.get_loss_dict\(|^class \w+\([\w.]*\bSplatfactoModel\b",
         "the loss seems to be nerfstudio's own: its hook is `ns-train splatfacto-legs`",
@@ -37,17 +36,11 @@ _INSTEAD = (
     ),
     (
         rf"(?i:(?<![\w@.]){_LOSS}(\[[^\]\"'\d:]+\]|\.get\([^\"'()][^()]*\))\s*\("
-        r"|\b\w*REGISTRY\w*\.(get|build)\()|= *[A-Z_]*(LOSS|CRITERI)[A-Z_]*\[[\w.]+\] *$",
-        _CHOSEN.format("a name in a registry"),
-    ),
-    (
-        r"\b\w*(Loss|Criterion)\w*\.(L1|MAE|PHOTO\w*)\b|^class \w*(Loss|Criterion)\w*\([^)\n]*Enum\)",
-        _CHOSEN.format("an Enum"),
-    ),
-    (
-        r"(?:[\"'\w\])] *: *|\bdict\([^)\n]*= *|= *(?:functools\.)?(?:partial|member|staticmethod)\(|\bmap\()"
+        r"|\b\w*REGISTRY\w*\.(get|build)\()|= *[A-Z_]*(LOSS|CRITERI)[A-Z_]*\[[\w.]+\] *$"
+        r"|\b\w*(Loss|Criterion)\w*\.(L1|MAE|PHOTO\w*)\b|^class \w*(Loss|Criterion)\w*\([^)\n]*Enum\)"
+        r"|(?:[\"'\w\])] *: *|\bdict\([^)\n]*= *|= *(?:functools\.)?(?:partial|member|staticmethod)\(|\bmap\()"
         r"(?:functools\.)?(?:partial\()?(?:[\w.]+\.)?(?:l1_loss\b(?!\()|L1Loss\()|= *[\"']l1_loss[\"'] *$",
-        _CHOSEN.format("an entry of a table"),
+        _CHOSEN.format("an entry of a table, a registry or an Enum"),
     ),
     (
         r"loss_sds|\bsds_loss|guidance\w*(\.train_step)?\(",

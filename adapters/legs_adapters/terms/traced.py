@@ -90,6 +90,12 @@ class Traced(NamedTuple):
         return self.is_l1 and self.is_picture and self.steps > 0 and (self.is_rival or not self.is_known)
 
     @property
+    def is_list(self) -> bool:
+        """Return whether that side may be a list of pixels, as [3, 500] or [500, 3] is."""
+        long = [side for side in self.shape if side > 1]
+        return len(long) == 2 and bool({3, 4}.intersection(long))
+
+    @property
     def why_other(self) -> str:
         """Return why it is not of a trained rendering and a photograph, in words; empty where it is."""
         if self.target < 0:
@@ -97,8 +103,8 @@ class Traced(NamedTuple):
         if not self.steps:
             return "only poses, exposures or embeddings are stepped after it"
         if not self.is_picture:
-            channels = [side for side in self.shape if side > 1]
-            what = "1 channel" if len(channels) < 3 else "not of 3 or 4 channels"
+            what = "not of 3 or 4 channels" if len([side for side in self.shape if side > 1]) > 2 else "1 channel"
+            what = "a list of pixels or points" if self.is_list else what
             return f"{{target}} is no photograph ({what}: {'x'.join(map(str, self.shape))})"
         if self.match is None:
             return "{target} cannot be compared with photographs: no image files are known (--photos DIR)"

@@ -224,12 +224,11 @@ class _Join:
             return
         candidate = own[0]
         place, text = candidate.function.place(candidate.form.node), traced.text(self._name(traced, [candidate]))
-        is_left = any(entry[:2] == candidate.key[:2] for entry in self.found.left)
-        known = [entry[:2] for entry in (*self.found.sites, *self.found.problems)]
-        if traced.is_unknown and not is_left:
+        left, told = ({one[:2] for one in read} for read in (self.found.left, self.found.sites + self.found.problems))
+        if traced.is_unknown and candidate.key[:2] not in left:
             term = Term(self.analysis, candidate.function, candidate.form)
             self.entries.append(self.verdicts.problem(term, place, text))
-        elif traced.is_list and traced.is_l1 and candidate.key[:2] in known:
+        elif traced.is_list and traced.is_l1 and candidate.key[:2] in told:
             self.entries.append(Problem.at(candidate.function, place, text, OF_PIXELS))
         else:
             why = Evidence("", text + self._differs(candidate, self.found.sites, "weighted"), ())

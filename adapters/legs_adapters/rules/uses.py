@@ -7,7 +7,7 @@ from typing import Iterator, List, Optional, Sequence, Tuple
 
 from legs_adapters.code.calls import likely_calls
 from legs_adapters.code.module import Function
-from legs_adapters.code.syntax import arguments, words_in
+from legs_adapters.code.syntax import arguments, one_line, words_in
 from legs_adapters.lexicon.meaning import Meaning, swapped
 from legs_adapters.lexicon.words import TRACKING
 from legs_adapters.rules.analysis import Analysis
@@ -42,7 +42,7 @@ def uses_of(analysis: Analysis, term: Term) -> List[Use]:
             is_loss = given[0].kind == "image" and given[-1].role == "target"
             is_loss = is_loss and (len(given) == 1 or swapped(*given) is False)
             is_masked = target is not term.target  # for the loss, unless known to be for something else
-            found.append(Use(caller, call, other, is_loss or is_masked or other is not None))
+            found.append(Use(caller, call, other, is_loss or is_masked or other is not None, one_line(image)))
     return sorted(found, key=lambda use: (use.caller.module.path, use.caller.place(use.call).line))
 
 

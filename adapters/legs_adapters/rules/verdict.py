@@ -79,9 +79,10 @@ class Verdicts:
         if others and not is_loss and not by_hand:
             return Left.at(function, place, others[0].other or "")
         unknown = [use for use in uses if not use.is_known]
-        if unknown and len(unknown) < len(uses):  # one body serves both
-            call, where = one_line(unknown[0].call), unknown[0].left
-            reason = f"nothing shows that {call} at {where.path}:{where.line} is the loss, as other calls are"
+        if unknown and (len(unknown) < len(uses) or len({use.target for use in uses}) > 1):  # one body serves several
+            odd = next((use for use in unknown if use.target != uses[0].target), unknown[0])
+            where = f"{one_line(odd.call)} at {odd.left.path}:{odd.left.line}"
+            reason = f"nothing shows that {where} is the loss, as other calls are"
             return _ByHand(reason, "give the loss a function of its own, and weight the L1 in that one")
         loss, others_read = reads_of(self.analysis.training, function, form)
         if others_read and not loss:

@@ -74,12 +74,14 @@ class Use(NamedTuple):
         caller, call: the call, and the function that it stands in.
         other: the evidence that it is not for the loss; None where it is.
         is_known: whether its arguments show which.
+        target: what it is given as the photograph.
     """
 
     caller: Function
     call: ast.Call
     other: Optional[Evidence]
     is_known: bool
+    target: str = ""
 
     @property
     def left(self) -> Left:

@@ -126,10 +126,9 @@ class Traced(NamedTuple):
             kinds = {"robust": "a Huber, Charbonnier or other bent loss, no L1", "signed": "no absolute value is seen"}
             known = kinds.get(self.kind, f"a {self.kind} loss, no L1")
             parts.append(f"{self.kind}, not looked into" if ":" in self.kind else known)
-        elif not why and self.gaussians:
-            parts.append(f"{self.gaussians:,} Gaussians are stepped after it")
         elif not why:
-            parts.append(f"{', '.join(self.parameters) or len(self.stepped)} are stepped after it")
+            known = f"{self.gaussians:,} Gaussians" if self.gaussians else ", ".join(self.parameters)
+            parts.append(f"{known or len(self.stepped)} are stepped after it")
         return "; ".join(parts)
 
 

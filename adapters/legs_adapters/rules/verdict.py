@@ -82,7 +82,7 @@ class Verdicts:
         if unknown and (len(unknown) < len(uses) or len({use.target for use in uses}) > 1):  # one body serves several
             odd = next((use for use in unknown if use.target != uses[0].target), unknown[0])
             where = f"{one_line(odd.call)} at {odd.left.path}:{odd.left.line}"
-            reason = f"nothing shows that {where} is the loss, as other calls are"
+            reason = f"nothing shows that {where} is the loss, and other calls share this body"
             return _ByHand(reason, "give the loss a function of its own, and weight the L1 in that one")
         loss, others_read = reads_of(self.analysis.training, function, form)
         if others_read and not loss:

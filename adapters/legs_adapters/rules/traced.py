@@ -214,7 +214,8 @@ class _Join:
         own = [candidate for candidate in stack if not self._is_definition(candidate)] or stack
         if any(candidate.key in self.settled for candidate in own):
             return
-        if not stack:  # that of a photograph is said: it is squared, or compiled; signed where no other is known
+        # That of a photograph is said: squared, or compiled; signed, or a list of pixels, where no other is known.
+        if not stack:
             here = self._line(traced.frames[0])
             is_other = traced.why_other or traced.kind == "l1" or (traced.kind == "signed" and self.is_known)
             is_silent = is_other and (self.is_known or not (traced.is_list and traced.is_l1))

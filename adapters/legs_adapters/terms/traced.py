@@ -103,8 +103,8 @@ class Traced(NamedTuple):
         if not self.steps:
             return "only poses, exposures or embeddings are stepped after it"
         if not self.is_picture:
-            what = "not of 3 or 4 channels" if len([side for side in self.shape if side > 1]) > 2 else "1 channel"
-            what = "a list of pixels or points" if self.is_list else what
+            what = "a list of pixels or points" if self.is_list else "1 channel"
+            what = "not of 3 or 4 channels" if sum(side > 1 for side in self.shape) > 2 else what
             return f"{{target}} is no photograph ({what}: {'x'.join(map(str, self.shape))})"
         if self.match is None:
             return "{target} cannot be compared with photographs: no image files are known (--photos DIR)"
